@@ -74,9 +74,14 @@ def _place(pipeline: Any, kappa: float | ArrayLike | None) -> NDArray[np.float64
 
 
 def nearest_point(pipeline: Any, kappa: float | ArrayLike | None) -> int:
-    """Number of the operating point of a fitted pipeline that is nearest to `kappa`."""
+    """Number of the operating point of a fitted pipeline that is nearest to `kappa`.
+
+    Every variable counts in its range, whatever its unit.
+    """
     distances = pipeline.operating_points_ - _place(pipeline, kappa)
-    return int(np.argmin(np.linalg.norm(distances, axis=1)))
+    span = np.ptp(distances, axis=0)
+    scaled = distances / np.where(span > 0, span, 1.0)
+    return int(np.argmin(np.linalg.norm(scaled, axis=1)))
 
 
 def fitted_pipeline(pipeline: Any, attribute: str) -> Any:

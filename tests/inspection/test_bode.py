@@ -13,6 +13,7 @@ from lpvlearn import (
 from lpvlearn.inspection import (
     BodeDisplay,
 )
+from lpvlearn.inspection.fitted import nearest_point
 
 from .conftest import KAPPA, ONE, STEP, random_model, spring
 
@@ -253,3 +254,15 @@ def test_a_pipeline_names_its_signals_and_units_stand_with_them(pipeline):
     assert ax.get_ylabel() == "to angle (rad)\nMagnitude (dB)"
     alone = BodeDisplay.from_estimator(pipeline, kappa=0.0).axes_[0, 0]
     assert (alone.get_title(), alone.get_ylabel()) == ("", "Magnitude (dB)")
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_the_nearest_point_is_the_same_in_other_units(unit):
+    points = np.array([[0.0, 0.0], [0.3, 1.0], [1.0, 0.1], [0.7, 0.9], [0.5, 0.4]])
+    scale = np.array([1.0, unit])
+    held = SimpleNamespace(
+        operating_points_=points * scale, lpv_=SimpleNamespace(n_scheduling=2)
+    )
+    assert nearest_point(held, [0.9, 0.8] * scale) == 3
+    held.operating_points_[:, 1] = unit  # constant: all are as far away in it
+    assert nearest_point(held, [0.9, 0.8] * scale) == 2
