@@ -222,12 +222,13 @@ class ErrorDisplay:
             nearest = nearest_point(restructurer, kappa)
             model = restructurer.local_models_[nearest]
             restructurer = restructurer.restructurers_[nearest]
-        if not hasattr(restructurer, "lti_") or not hasattr(restructurer, "structure_"):
-            raise ValueError(
-                "`restructurer` must be a fitted GrayBoxRestructurer. Got "
-                f"{type(restructurer).__name__} without `lti_`; call fit_model() "
-                "first, or give a pipeline with a structure."
-            )
+        for attribute in ("structure_", "lti_"):
+            if not hasattr(restructurer, attribute):
+                raise ValueError(
+                    "`restructurer` must be a fitted GrayBoxRestructurer (call its "
+                    "fit_model() first), or a fitted pipeline with a structure. Got "
+                    f"{type(restructurer).__name__} without `{attribute}`."
+                )
         check_model("model", model)
         assert model is not None
         dropped = restructurer.dropped_feedthrough_

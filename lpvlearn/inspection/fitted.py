@@ -32,8 +32,8 @@ def models_of(
     if not hasattr(estimator, "lpv_"):
         raise ValueError(
             "`estimator` must be a fitted SubspaceLTI, GrayBoxRestructurer, "
-            f"LocalLPVPipeline or OutputErrorLPV. Got {type(estimator).__name__} "
-            "without `lti_` or `lpv_`; call fit() first."
+            "LocalLPVPipeline or OutputErrorLPV: call its fit() first. Got "
+            f"{type(estimator).__name__} without `lti_` or `lpv_`."
         )
     if kappa is not None and as_numbers("kappa", kappa).ndim == 2:
         places = places_of(estimator, kappa)
@@ -89,8 +89,8 @@ def fitted_pipeline(pipeline: Any, attribute: str) -> Any:
     pipeline = unwrapped(pipeline)
     if not hasattr(pipeline, attribute):
         raise ValueError(
-            "`pipeline` must be a fitted LocalLPVPipeline. Got "
-            f"{type(pipeline).__name__} without `{attribute}`; call fit() first."
+            "`pipeline` must be a fitted LocalLPVPipeline: call its fit() first. Got "
+            f"{type(pipeline).__name__} without `{attribute}`."
         )
     return pipeline
 

@@ -105,9 +105,8 @@ class SingularValueDisplay:
         subspace = unwrapped(subspace)
         if not hasattr(subspace, "singular_values_"):
             raise ValueError(
-                "`subspace` must be a fitted SubspaceLTI. Got "
-                f"{type(subspace).__name__} without `singular_values_`; call fit() "
-                "first."
+                "`subspace` must be a fitted SubspaceLTI: call its fit() first. Got "
+                f"{type(subspace).__name__} without `singular_values_`."
             )
         display = cls(subspace.singular_values_, subspace.order_)
         return display.plot(ax, n_shown=n_shown)

@@ -230,7 +230,7 @@ def test_bode_of_a_restructurer_shows_its_model(pipeline):
         ),
         (
             lambda: BodeDisplay.from_estimator(SubspaceLTI()),
-            r"`estimator` must be a fitted SubspaceLTI.*call fit\(\) first",
+            r"`estimator` must be a fitted SubspaceLTI.*call its fit\(\) first\. Got",
         ),
     ],
 )

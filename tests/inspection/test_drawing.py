@@ -105,7 +105,7 @@ def test_others_must_not_take_the_name_of_the_pipelines_own(pipeline):
 
 def test_displays_ask_for_a_fitted_pipeline():
     for display in (ParameterDisplay, PoleDisplay):
-        with pytest.raises(ValueError, match=r"fitted LocalLPVPipeline.*call fit"):
+        with pytest.raises(ValueError, match=r"fitted LocalLPVPipeline: call its fit"):
             display.from_estimator(LocalLPVPipeline())
 
 

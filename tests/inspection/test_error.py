@@ -1,6 +1,7 @@
 """The error of a restructured model over frequency."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,6 +93,10 @@ def test_an_error_of_zero_draws_without_a_warning():
         (
             lambda: ErrorDisplay.from_estimator(GrayBoxRestructurer(), ONE),
             r"fitted GrayBoxRestructurer.*fit_model\(\) first",
+        ),
+        (
+            lambda: ErrorDisplay.from_estimator(SimpleNamespace(lti_=ONE), ONE),
+            "pipeline with a structure. Got SimpleNamespace without `structure_`",
         ),
         (
             lambda: ErrorDisplay.from_models(ONE, ONE, floor=-1),

@@ -52,5 +52,5 @@ def test_singular_value_errors_teach(values, order, message):
 
 
 def test_singular_values_ask_for_a_fitted_estimator():
-    with pytest.raises(ValueError, match=r"fitted SubspaceLTI.*call fit\(\)"):
+    with pytest.raises(ValueError, match=r"fitted SubspaceLTI: call its fit\(\)"):
         SingularValueDisplay.from_estimator(SubspaceLTI())
