@@ -19,7 +19,7 @@ from .. import (
     save,
     split_levels,
 )
-from .judgement import course, measured_signals, simulation_text
+from .judgement import course, measured_signals, simulation_text, telling_apart
 from .output import whole_folder
 from .structure_file import read_structure
 from .tables import EXPERIMENT, check_table, columns_of, read_tables, with_times
@@ -80,14 +80,15 @@ def fit(options: argparse.Namespace) -> None:
                     options.validation, form, found.experiment, label=True
                 )
                 table = with_times(judged.rows, roles["time"], form.time_unit)
+        simulator = telling_apart(pipeline, judged.experiment)
         with told.step("simulation"):
-            X, y = measured_signals(pipeline, table, judged.name)
-            report = fit_report(pipeline, X, y, initial_state=start)
+            X, y = measured_signals(simulator, table, judged.name)
+            report = fit_report(simulator, X, y, initial_state=start)
         with told.step("report", bar=True):
             pipeline.report_.to_csv(folder / "points.csv")
             pipeline.parameter_report_.to_csv(folder / "parameters.csv")
             report.to_csv(folder / "fit.csv", index=False)
-            pipeline.to_html_report(
+            simulator.to_html_report(
                 folder / "report.html",
                 X,
                 y,

@@ -7,8 +7,10 @@ import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from .. import LocalLPVPipeline, readable_report
@@ -23,6 +25,20 @@ class Signals(NamedTuple):
 
     X: pd.DataFrame
     y: pd.DataFrame | None  # where the outputs were measured
+
+
+def telling_apart(pipeline: LocalLPVPipeline, column: str | None) -> LocalLPVPipeline:
+    """A fitted pipeline, to which `column` tells the experiments of tables apart.
+
+    One that was fitted to a single record has no such column, and simulates several as
+    one record.
+    """
+    if column is None or column == pipeline.experiment:
+        return pipeline
+    found = copy(pipeline).set_params(experiment=column)
+    found.feature_names_in_ = np.append(pipeline.feature_names_in_, column)
+    found.n_features_in_ += 1
+    return found
 
 
 def signals_of(pipeline: LocalLPVPipeline, table: pd.DataFrame, name: str) -> Signals:

@@ -17,6 +17,7 @@ from .judgement import (
     measured_signals,
     signals_of,
     simulation_text,
+    telling_apart,
 )
 from .output import whole_output
 from .tables import check_table, read_tables, with_times, write_table
@@ -94,9 +95,8 @@ def _model_and_table(options: argparse.Namespace, told: Course) -> _Given:
         )
     if options.table is None:
         return _Given(pipeline, None)
-    form, experiment = options.format, pipeline.experiment
+    form = options.format
     with told.step("reading of the table"):
-        label = experiment is not None
-        found = read_tables(options.table, form, experiment, label=label)
+        found = read_tables(options.table, form, pipeline.experiment, label=True)
         table = with_times(found.rows, pipeline.time, form.time_unit)
-    return _Given(pipeline, table, found.name)
+    return _Given(telling_apart(pipeline, found.experiment), table, found.name)

@@ -58,6 +58,35 @@ def test_report_tells_the_summary_and_writes_a_page(folder, model, tmp_path):
     assert "Measured and simulated" in page.read_text()
 
 
+@pytest.mark.parametrize("timed", [False, True])
+def test_several_files_are_experiments_to_a_model_of_one_file(folder, tmp_path, timed):
+    table = pd.read_csv(folder / "runs.csv").query("kappa == 0.5")
+    table = table.drop(columns=["run", "kappa", "extra"] + ["time"] * (not timed))
+    table.to_csv(tmp_path / "one.csv", index=False)
+    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for path, n in zip(files, (200, 300), strict=True):  # from rest, both
+        table[:n].to_csv(path, index=False)
+    clock = ["--time", "time"] if timed else ["--sampling-time", 0.02]
+    arguments = ["fit", tmp_path / "one.csv", "--inputs", "force", *clock, "--order", 2]
+    arguments += ["--outputs", "position", "--output", tmp_path / "f", "--quiet"]
+    assert run(*arguments, "--validation", *files) == (0, "", "")
+    fit = pd.read_csv(tmp_path / "f" / "fit.csv")
+    assert list(fit["experiment"]) == ["a", "b"]
+    assert (fit["BFT"] > 99.9).all()
+    model = tmp_path / "f" / "model.zip"
+    status, out, error = run("predict", model, *files)
+    simulated = pd.read_csv(io.StringIO(out))
+    assert status == 0 and "Simulation of 2 tables" in error
+    for path, found in simulated.groupby("experiment"):
+        alone = pd.read_csv(
+            io.StringIO(run("predict", model, tmp_path / f"{path}.csv")[1])
+        )
+        assert_allclose(found["position"], alone["position"])
+    page = tmp_path / "page.html"
+    status, out, _ = run("report", model, "--table", *files, "--output", page)
+    assert status == 0 and " a " in out and " b " in out
+
+
 def test_failures_tell_why(folder, model, tmp_path):
     other = tmp_path / "other.zip"
     save(StateSpace(-1, 1, 1), other)
