@@ -38,6 +38,8 @@ _SEPARATORS = ("\t", ";", ",", "|", _BLANKS)
 
 _COMMA_NUMBER = r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*"
 
+_NO_UNIT = ("", "-", "1")
+
 _NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "inf", "-inf")
 
 # Numbers above are seconds beyond the year 5000: rather parts of seconds since 1970,
@@ -294,10 +296,15 @@ def _header(cells: Sequence[Sequence[Any]], *, commas: bool) -> Header:
     ]
     if len(below) == 2:
         one, two = (kinds[k] for k in below)
-        if ("text", "number") in zip(one, two, strict=True) and "number" not in one:
-            told = [str(cell or "").strip("[]() ") for cell in cells[below[0]]]
-            pairs = zip(names, told, strict=True)
-            units = {name: unit for name, unit in pairs if unit not in ("", "-")}
+        told = [str(cell or "").strip("[]() ") for cell in cells[below[0]]]
+        pairs = zip(names, told, strict=True)
+        units = {name: unit for name, unit in pairs if unit not in _NO_UNIT}
+        numbers = {unit for unit, k in zip(told, one, strict=True) if k == "number"}
+        if (
+            ("text", "number") in zip(one, two, strict=True)
+            and numbers <= {"1"}  # unless they are a sample
+            and one.count("number") <= len(units)
+        ):
             return Header(names, units, below[0] + 1)
     return Header(names, {}, place + 1)
 

@@ -140,6 +140,17 @@ def test_several_files_are_as_many_experiments(tmp_path, table):
         assert "run" not in read_tables(paths, Format(), None, label=True).rows
 
 
+def test_a_unit_of_one_is_none_and_a_first_sample_of_ones_is_no_row_of_units(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("run,t,u,y\n-,s,1,[1]\n0,0.0,1,2\n0,0.1,1,3\n")
+    found = read_tables([path], Format(), None, label=True)
+    assert found.units == {"t": "s"}
+    assert found.rows["y"].tolist() == [2, 3]
+    path.write_text("t,u,y\n1,1,-\n2,1,0.5\n3,1,0.7\n")
+    found = read_tables([path], Format(), None, label=True)
+    assert found.units == {} and len(found.rows) == 3
+
+
 def test_sheets_of_the_same_columns_are_experiments(tmp_path, table):
     pytest.importorskip("openpyxl")
     path = tmp_path / "a.xlsx"
