@@ -71,7 +71,8 @@ def fit(options: argparse.Namespace) -> None:
             pipeline = _pipeline(options, roles, structure).set_params(
                 units=units or None
             )
-            table = with_times(table, roles["time"], form.time_unit)
+            table, said = with_times(table, roles["time"], form.time_unit)
+            told.say(said)
         with told.step("fit", bar=True):
             pipeline.fit(table[features], table[outputs])
         if options.validation is not None:
@@ -79,7 +80,8 @@ def fit(options: argparse.Namespace) -> None:
                 judged = read_tables(
                     options.validation, form, found.experiment, label=True
                 )
-                table = with_times(judged.rows, roles["time"], form.time_unit)
+                table, said = with_times(judged.rows, roles["time"], form.time_unit)
+                told.say(said)
         simulator = telling_apart(pipeline, judged.experiment)
         with told.step("simulation"):
             X, y = measured_signals(simulator, table, judged.name)
@@ -98,7 +100,7 @@ def fit(options: argparse.Namespace) -> None:
             )
             save(pipeline, folder / "model.zip")
         simulated = simulation_text(report, judged.name, start)
-        text = "\n\n".join([pipeline.summary(), simulated, told.text()])
+        text = "\n\n".join([pipeline.summary(), *told.said, simulated, told.text()])
         (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
     if not options.quiet:
         print(

@@ -81,6 +81,7 @@ class Course:
     def __init__(self, verbose: bool) -> None:
         self._watch = Stopwatch(verbose=verbose)
         self._told: dict[str, list[str]] = {}  # by step
+        self.said: list[str] = []  # what is no warning, each once
 
     @contextmanager
     def step(self, name: str, *, bar: bool = False) -> Iterator[None]:
@@ -99,6 +100,11 @@ class Course:
         new = [m for m in dict.fromkeys(messages) if m not in known]
         if new:
             self._told.setdefault(name, []).extend(new)
+
+    def say(self, text: str) -> None:
+        """Keep a text, if it is one, that stands before a simulation."""
+        if text and text not in self.said:
+            self.said.append(text)
 
     @property
     def warned(self) -> bool:

@@ -8,6 +8,7 @@ import gzip
 import itertools
 import re
 import sys
+import time
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -42,11 +43,14 @@ _NO_UNIT = ("", "-", "1")
 
 _NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "inf", "-inf")
 
-# Numbers above are seconds beyond the year 5000: rather parts of seconds since 1970,
-# milliseconds, microseconds or nanoseconds.
-_EPOCHS = {"ns": 1e17, "us": 1e14, "ms": 1e11}
-
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+_LATEST = 1e11  # numbers above are seconds beyond the year 5000: rather parts of them
+
+# Parts of seconds since 1970 where they make dates from 1990 until tomorrow: others
+# are those of a clock that began when it was switched on, as clocks of computers do.
+_SINCE_1970 = ("ms", "us", "ns")
+_YEAR_1990, _DAY = 631152000.0, 86400.0  # s
 
 EXPERIMENT = "experiment"  # column that tells the tables apart, where none is named
 
@@ -83,6 +87,13 @@ class Tables(NamedTuple):
     units: dict[str, str]
     experiment: str | None  # column that tells experiments apart, where there is one
     name: str
+
+
+class Times(NamedTuple):
+    """A table with seconds or dates in its column of the time."""
+
+    rows: pd.DataFrame
+    told: str = ""  # what they were taken for, where nobody said so
 
 
 def check_table(path: Path) -> None:
@@ -353,26 +364,44 @@ def _sheets(path: Path) -> list[Record]:
 # -- what stands in a table --------------------------------------------------------
 
 
-def with_times(
-    table: pd.DataFrame, column: str | None, unit: str | None
-) -> pd.DataFrame:
-    """The table with seconds or dates in its column of the time."""
+def with_times(table: pd.DataFrame, column: str | None, unit: str | None) -> Times:
+    """The times of a table, in the column of that name: numbers of a unit, or dates."""
     if column not in table.columns:
-        return table
-    values = table[column]
+        return Times(table)
+    values, told = table[column], ""
     if pd.api.types.is_numeric_dtype(values):
-        largest = float(np.nanmax(np.abs(values), initial=0.0))
-        since = [unit for unit, least in _EPOCHS.items() if largest >= least]
-        if unit is None and since:
-            dates = pd.to_datetime(values, unit=since[0])
-            return table.assign(**{str(column): dates})
-        return (
-            table.assign(**{str(column): values * TIME_UNITS[unit]}) if unit else table
-        )
-    try:
-        return table.assign(**{str(column): _dates(values)})
-    except (ValueError, TypeError, OverflowError):
-        return table  # the library tells what it is
+        since = _unit_since_1970(values)
+        if since is not None and unit in (None, since):
+            values = pd.to_datetime(values, unit=since)
+            told = (
+                f"Times in column {column!r} are taken as {since} since 1970, from "
+                f"{values.min()}; --time-unit tells otherwise."
+            )
+        elif unit is not None:
+            values = values * TIME_UNITS[unit]
+        elif _LATEST <= values.abs().max() < np.inf:
+            raise ValueError(
+                f"Times in column {column!r} must have a unit: they reach "
+                f"{values.abs().max():.4g}, which as seconds is beyond the year 5000, "
+                f"and as {', '.join(_SINCE_1970)} since 1970 is no date from 1990 "
+                "until now. Give it as --time-unit."
+            )
+    else:
+        with suppress(ValueError, TypeError, OverflowError):  # the library tells why
+            values = _dates(values)
+    return Times(table.assign(**{str(column): values}), told)
+
+
+def _unit_since_1970(values: pd.Series) -> str | None:
+    """Of what numbers make dates since 1970; None where these cannot be."""
+    first, last = float(values.min()), float(values.max())
+    for unit in _SINCE_1970:
+        if (
+            first * TIME_UNITS[unit] > _YEAR_1990
+            and last * TIME_UNITS[unit] < time.time() + _DAY
+        ):
+            return unit
+    return None
 
 
 def _dates(values: pd.Series) -> pd.Series:

@@ -37,10 +37,10 @@ def predict(options: argparse.Namespace) -> None:
                 found = pipeline.predict_with_initial_state(X, y)
             else:
                 found = np.asarray(pipeline.predict(X))
-            text = []
+            text = [*told.said]
             if y is not None:
                 report = fit_report(pipeline, X, y, initial_state=options.initial_state)
-                text = [simulation_text(report, name, options.initial_state)]
+                text.append(simulation_text(report, name, options.initial_state))
     kept = [n for n in (pipeline.experiment, pipeline.time) if n is not None]
     simulated = pd.DataFrame(
         np.reshape(found, (len(X), -1)), X.index, list(pipeline.output_names_)
@@ -62,7 +62,7 @@ def report(options: argparse.Namespace) -> None:
     with course() as told:
         pipeline, table, name = _model_and_table(options, told)
         told.add("fit", pipeline.warnings_)
-        text, X, y = [pipeline.summary()], None, None
+        text, X, y = [pipeline.summary(), *told.said], None, None
         if table is not None:
             with told.step("simulation"):
                 X, y = measured_signals(pipeline, table, name)
@@ -98,5 +98,6 @@ def _model_and_table(options: argparse.Namespace, told: Course) -> _Given:
     form = options.format
     with told.step("reading of the table"):
         found = read_tables(options.table, form, pipeline.experiment, label=True)
-        table = with_times(found.rows, pipeline.time, form.time_unit)
-    return _Given(telling_apart(pipeline, found.experiment), table, found.name)
+        times = with_times(found.rows, pipeline.time, form.time_unit)
+        told.say(times.told)
+    return _Given(telling_apart(pipeline, found.experiment), times.rows, found.name)

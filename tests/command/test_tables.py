@@ -14,7 +14,7 @@ NAMES = ["Zeit", "Strom [A]", "Winkel"]
 
 @pytest.fixture
 def table():
-    start = pd.Timestamp("2026-03-04 23:59:59")
+    start = pd.Timestamp("2024-03-04 23:59:59")
     return pd.DataFrame(
         {
             "Zeit": start + pd.to_timedelta(0.05 * np.arange(40), unit="s"),
@@ -31,7 +31,7 @@ def german(table):
 
 def read(path, *, unit=None, **form):
     found = read_tables([path], Format(**form), None, label=True)
-    return with_times(found.rows, "Zeit", unit), found.units
+    return with_times(found.rows, "Zeit", unit).rows, found.units
 
 
 def check(found, table):
@@ -90,8 +90,23 @@ def test_numbers_since_1970_are_dates_and_others_have_their_unit(
     since = (table["Zeit"] - pd.Timestamp(0)) // pd.Timedelta(1, unit)
     table.assign(Zeit=since).to_csv(path, index=False)
     check(read(path)[0], table)
+    told = with_times(table.assign(Zeit=since), "Zeit", None).told
+    assert f"taken as {unit} since 1970, from 2024-03-04 23:59:59; --time-" in told
     table.assign(Zeit=0.05 * factor * np.arange(40)).to_csv(path, index=False)
     assert_allclose(read(path, unit=unit)[0]["Zeit"], 0.05 * np.arange(40))
+
+
+@pytest.mark.parametrize(
+    ("unit", "begin"), [("ns", 5 * 10**14), ("us", 5 * 10**14), ("ms", 10**13)]
+)
+def test_numbers_that_make_no_dates_ask_for_their_unit(table, unit, begin):
+    step = pd.Timedelta("50ms") // pd.Timedelta(1, unit)
+    table["Zeit"] = begin + step * np.arange(40)
+    with pytest.raises(ValueError, match="'Zeit' must have a unit.*as --time-unit"):
+        with_times(table, "Zeit", None)
+    found = with_times(table, "Zeit", unit)
+    assert_allclose(found.rows["Zeit"].diff()[1:], 0.05, rtol=1e-4)
+    assert found.told == ""
 
 
 @pytest.mark.parametrize("text", ["{:02.0f}:{:04.1f}", "{:.0f}:{:05.2f}"])
@@ -100,7 +115,7 @@ def test_two_fields_with_a_decimal_are_minutes_and_seconds(tmp_path, table, text
     seconds = 58.0 + 0.1 * np.arange(40)
     times = [text.format(s // 60, s % 60) for s in seconds.round(6)]
     table.assign(Zeit=times).to_csv(path, index=False)
-    found = with_times(read(path)[0], "Zeit", None)["Zeit"]
+    found = read(path)[0]["Zeit"]
     assert_allclose((found - found[0]) / pd.Timedelta("1s"), seconds - 58.0, atol=1e-6)
 
 
@@ -110,7 +125,7 @@ def test_two_fields_without_are_hours_and_minutes_and_that_is_told(tmp_path, tab
     with pytest.warns(
         UserWarning, match="'00:00' are read as hours and minutes.*give hours as well"
     ):
-        found = with_times(read(path)[0], "Zeit", None)["Zeit"]
+        found = read(path)[0]["Zeit"]
     assert_allclose(found.diff()[1:] / pd.Timedelta("1s"), 60.0)
 
 
