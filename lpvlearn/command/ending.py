@@ -24,6 +24,11 @@ _OPTIONS = (
         "take --initial-state estimate",
     ),
     (r"initial_state='estimate'", "--initial-state estimate"),
+    (
+        r"Divide a column of milliseconds by 1000, or give dates or time differences, "
+        r"which tell their unit",
+        "Give --time-unit where they are not",
+    ),
     (r"`tol`", "`--levels`"),
     (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
     (r"`(operating|sampling)_(point|time)`", r"`--\1-\2`"),

@@ -68,10 +68,12 @@ def fit(options: argparse.Namespace) -> None:
                     options.structure, len(inputs), len(outputs)
                 )
                 units = units | own
+            units = {name: u for name, u in units.items() if name != roles["time"]}
             pipeline = _pipeline(options, roles, structure).set_params(
                 units=units or None
             )
-            table, said = with_times(table, roles["time"], form.time_unit)
+            time, unit = roles["time"], form.time_unit
+            table, said = with_times(table, time, unit, found.units)
             told.say(said)
         with told.step("fit", bar=True):
             pipeline.fit(table[features], table[outputs])
@@ -80,7 +82,7 @@ def fit(options: argparse.Namespace) -> None:
                 judged = read_tables(
                     options.validation, form, found.experiment, label=True
                 )
-                table, said = with_times(judged.rows, roles["time"], form.time_unit)
+                table, said = with_times(judged.rows, time, unit, judged.units)
                 told.say(said)
         simulator = telling_apart(pipeline, judged.experiment)
         with told.step("simulation"):

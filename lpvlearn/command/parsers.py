@@ -122,7 +122,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         ("outputs", "what answers (required)"),
         ("scheduling", "what the dynamics depend on (default: nothing)"),
         ("experiment", "which run a row belongs to (default: each file is one)"),
-        ("time", "seconds or dates; see --time-unit"),
+        ("time", "numbers or dates; see --time-unit"),
         ("operating-point", "labels of the operating points (default: found)"),
     ):
         required = name == "outputs"
@@ -216,5 +216,5 @@ def _add_format(parser: argparse.ArgumentParser) -> None:
     add(
         "--time-unit",
         choices=TIME_UNITS,
-        help="of numbers in the column of the time (default s)",
+        help="of numbers in the column of the time (default: as the table tells, or s)",
     )

@@ -10,7 +10,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -44,6 +44,18 @@ _NO_UNIT = ("", "-", "1")
 _NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "inf", "-inf")
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+# Other words for them, as tables have them
+_UNIT_WORDS = {
+    **dict.fromkeys(("sec", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("μs", "usec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("mins", "minute", "minutes"), "min"),
+    **dict.fromkeys(("hr", "hrs", "hour", "hours"), "h"),
+}
+
+_UNIT_IN_NAME = r"(?:[\[(/]\s*|_)([^\W_]+)\s*[\])]?$"  # t [ms], t (ms), t/ms, t_ms
 
 _LATEST = 1e11  # numbers above are seconds beyond the year 5000: rather parts of them
 
@@ -364,13 +376,24 @@ def _sheets(path: Path) -> list[Record]:
 # -- what stands in a table --------------------------------------------------------
 
 
-def with_times(table: pd.DataFrame, column: str | None, unit: str | None) -> Times:
-    """The times of a table, in the column of that name: numbers of a unit, or dates."""
-    if column not in table.columns:
+def with_times(
+    table: pd.DataFrame,
+    column: str | None,
+    unit: str | None,
+    units: Mapping[str, str],
+) -> Times:
+    """The times of a table, in the column of that name: numbers of a unit, or dates.
+
+    The unit is the one given, else that of `units`, by name, or of the column's name.
+    """
+    if column is None or column not in table.columns:
         return Times(table)
     values, told = table[column], ""
     if pd.api.types.is_numeric_dtype(values):
-        since = _unit_since_1970(values)
+        own = None if unit is not None else _unit_of(column, units)
+        if own not in (None, "s"):
+            told = f"Times in column {column!r} are taken as {own}, as the table tells."
+        unit, since = unit or own, _unit_since_1970(values)
         if since is not None and unit in (None, since):
             values = pd.to_datetime(values, unit=since)
             told = (
@@ -389,7 +412,24 @@ def with_times(table: pd.DataFrame, column: str | None, unit: str | None) -> Tim
     else:
         with suppress(ValueError, TypeError, OverflowError):  # the library tells why
             values = _dates(values)
-    return Times(table.assign(**{str(column): values}), told)
+    return Times(table.assign(**{column: values}), told)
+
+
+def _unit_of(column: str, units: Mapping[str, str]) -> str | None:
+    """The unit of time that a row of units tells, or the end of the column's name."""
+    in_name = re.search(_UNIT_IN_NAME, column)
+    text = units.get(column, in_name[1] if in_name else "")
+    unit = text.casefold().strip(".")
+    unit = _UNIT_WORDS.get(unit, unit)
+    if unit in TIME_UNITS:
+        return unit
+    if column in units:
+        warnings.warn(
+            f"Times in column {column!r} are read as seconds: their unit {text!r} is "
+            f"none of {', '.join(TIME_UNITS)}. Give --time-unit if they are others.",
+            stacklevel=3,
+        )
+    return None
 
 
 def _unit_since_1970(values: pd.Series) -> str | None:

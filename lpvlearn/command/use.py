@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,7 @@ def predict(options: argparse.Namespace) -> None:
     if options.output is not None:
         check_table(options.output)
     with course() as told:
-        pipeline, table, name = _model_and_table(options, told)
+        pipeline, table, name, rows = _model_and_table(options, told)
         with told.step("simulation"):
             X, y = signals_of(pipeline, table, name)
             if estimate:
@@ -45,7 +45,7 @@ def predict(options: argparse.Namespace) -> None:
     simulated = pd.DataFrame(
         np.reshape(found, (len(X), -1)), X.index, list(pipeline.output_names_)
     )
-    simulated = pd.concat([X[list(dict.fromkeys(kept))], simulated], axis=1)
+    simulated = pd.concat([rows[list(dict.fromkeys(kept))], simulated], axis=1)
     if options.output is None:
         write_table(simulated, None, options.format)
     else:
@@ -60,7 +60,7 @@ def predict(options: argparse.Namespace) -> None:
 def report(options: argparse.Namespace) -> None:
     """Run the command: what the fit found, and the simulation of a table."""
     with course() as told:
-        pipeline, table, name = _model_and_table(options, told)
+        pipeline, table, name, _ = _model_and_table(options, told)
         told.add("fit", pipeline.warnings_)
         text, X, y = [pipeline.summary(), *told.said], None, None
         if table is not None:
@@ -80,6 +80,7 @@ class _Given(NamedTuple):
     pipeline: LocalLPVPipeline
     table: pd.DataFrame | None
     name: str = ""
+    rows: Any = None  # with the times as they stand in the file
 
 
 def _model_and_table(options: argparse.Namespace, told: Course) -> _Given:
@@ -98,6 +99,7 @@ def _model_and_table(options: argparse.Namespace, told: Course) -> _Given:
     form = options.format
     with told.step("reading of the table"):
         found = read_tables(options.table, form, pipeline.experiment, label=True)
-        times = with_times(found.rows, pipeline.time, form.time_unit)
+        times = with_times(found.rows, pipeline.time, form.time_unit, found.units)
         told.say(times.told)
-    return _Given(telling_apart(pipeline, found.experiment), times.rows, found.name)
+    pipeline = telling_apart(pipeline, found.experiment)
+    return _Given(pipeline, times.rows, found.name, found.rows)

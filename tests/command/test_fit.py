@@ -1,11 +1,14 @@
 """``lpvlearn fit``: from a table to a folder that is whole, or not there."""
 
+import io
 import json
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
+
+from lpvlearn import load
 
 from ..conftest import KAPPA, spring_tables, spring_truth
 from .conftest import ROLES, run
@@ -64,6 +67,25 @@ def test_levels_of_the_column_that_tells_experiments_apart(tmp_path):
         assert run(*given, "--output", target) == (0, "", "")
         points = pd.read_csv(target / "points.csv", index_col=0)
         assert_allclose(points.index, KAPPA)
+
+
+def test_a_row_of_units_tells_that_of_the_time(folder, tmp_path):
+    table = pd.read_csv(folder / "runs.csv").query("kappa == 0.5")
+    text = table[["time", "force", "position"]].to_csv(index=False)
+    one, two = tmp_path / "one.csv", tmp_path / "two.csv"
+    one.write_text(text)
+    two.write_text(text.replace("\n", "\nms,N,-\n", 1))
+    roles = ["--inputs", "force", "--outputs", "position", "--time", "time"]
+    target = tmp_path / "f"
+    status, out, _ = run("fit", two, *roles, "--order", 2, "--output", target)
+    assert status == 0 and "samples at 2e-05 s" in out
+    assert out.count("Times in column 'time' are taken as ms, as the table tells.") == 1
+    assert load(target / "model.zip").units == {"force": "N"}
+    status, out, error = run("predict", target / "model.zip", two)
+    assert status == 0 and "are taken as ms" in error
+    assert_allclose(pd.read_csv(io.StringIO(out))["time"], table["time"])
+    status, _, error = run("predict", target / "model.zip", one)
+    assert status == 1 and "read as seconds. Give --time-unit where" in error
 
 
 def test_a_folder_is_not_written_over_unasked(folder):

@@ -31,7 +31,7 @@ def german(table):
 
 def read(path, *, unit=None, **form):
     found = read_tables([path], Format(**form), None, label=True)
-    return with_times(found.rows, "Zeit", unit).rows, found.units
+    return with_times(found.rows, "Zeit", unit, found.units).rows, found.units
 
 
 def check(found, table):
@@ -90,10 +90,40 @@ def test_numbers_since_1970_are_dates_and_others_have_their_unit(
     since = (table["Zeit"] - pd.Timestamp(0)) // pd.Timedelta(1, unit)
     table.assign(Zeit=since).to_csv(path, index=False)
     check(read(path)[0], table)
-    told = with_times(table.assign(Zeit=since), "Zeit", None).told
+    told = with_times(table.assign(Zeit=since), "Zeit", None, {}).told
     assert f"taken as {unit} since 1970, from 2024-03-04 23:59:59; --time-" in told
     table.assign(Zeit=0.05 * factor * np.arange(40)).to_csv(path, index=False)
     assert_allclose(read(path, unit=unit)[0]["Zeit"], 0.05 * np.arange(40))
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "seconds"),
+    [
+        ("t", {"t": "ms"}, 1e-3),
+        ("t", {"t": "µs"}, 1e-6),
+        ("t [ms]", {}, 1e-3),
+        ("t (Minutes)", {}, 60.0),
+        ("Zeit / ms", {}, 1e-3),
+        ("clock_ns", {}, 1e-9),
+        ("t [ms]", {"t [ms]": "s"}, 1.0),
+        ("t_max", {}, 1.0),
+        ("ms", {}, 1.0),
+    ],
+)
+def test_units_that_a_table_tells_are_those_of_its_times(name, units, seconds):
+    table = pd.DataFrame({name: np.arange(5)})
+    found = with_times(table, name, None, units)
+    assert_allclose(found.rows[name], seconds * np.arange(5), rtol=1e-15)
+    assert ("as the table tells" in found.told) == (seconds != 1.0)
+    given = with_times(table, name, "h", units)  # which counts more
+    assert_allclose(given.rows[name], 3600.0 * np.arange(5))
+
+
+def test_a_unit_that_is_none_of_time_is_told():
+    table = pd.DataFrame({"t": np.arange(5)})
+    with pytest.warns(UserWarning, match="as seconds: their unit 'd' is none of s, ms"):
+        found = with_times(table, "t", None, {"t": "d"})
+    assert_allclose(found.rows["t"], np.arange(5))
 
 
 @pytest.mark.parametrize(
@@ -103,8 +133,8 @@ def test_numbers_that_make_no_dates_ask_for_their_unit(table, unit, begin):
     step = pd.Timedelta("50ms") // pd.Timedelta(1, unit)
     table["Zeit"] = begin + step * np.arange(40)
     with pytest.raises(ValueError, match="'Zeit' must have a unit.*as --time-unit"):
-        with_times(table, "Zeit", None)
-    found = with_times(table, "Zeit", unit)
+        with_times(table, "Zeit", None, {})
+    found = with_times(table, "Zeit", unit, {})
     assert_allclose(found.rows["Zeit"].diff()[1:], 0.05, rtol=1e-4)
     assert found.told == ""
 
