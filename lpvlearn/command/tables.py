@@ -64,6 +64,8 @@ _LATEST = 1e11  # numbers above are seconds beyond the year 5000: rather parts o
 _SINCE_1970 = ("ms", "us", "ns")
 _YEAR_1990, _DAY = 631152000.0, 86400.0  # s
 
+_HOURS = 24.0  # of a day
+
 EXPERIMENT = "experiment"  # column that tells the tables apart, where none is named
 
 
@@ -464,6 +466,11 @@ def _dates(values: pd.Series) -> pd.Series:
             "If they are minutes and seconds, give hours as well: 00:00:07.",
             stacklevel=2,
         )
+    clock = text.str.fullmatch(r"\d+(:\d\d){1,2}(\.\d+)?") | values.isna()
+    hours = text.str.extract(r"^(\d+):", expand=False).astype(float)
+    if clock.all() and (hours >= _HOURS).any():  # what has elapsed, no time of day
+        text = (text + ":00" if short.all() else text).where(values.notna())
+        return pd.Timestamp(0) + pd.to_timedelta(text)
     first = text.str.extract(r"^(\d{1,2})[./]", expand=False).astype(float)
     by_day = bool(text.str.match(r"^\d+\.\d+\.").any() or (first > 12).any())
     with warnings.catch_warnings():

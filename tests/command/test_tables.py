@@ -159,6 +159,23 @@ def test_two_fields_without_are_hours_and_minutes_and_that_is_told(tmp_path, tab
     assert_allclose(found.diff()[1:] / pd.Timedelta("1s"), 60.0)
 
 
+@pytest.mark.parametrize(
+    ("text", "step"), [("{}:{:02d}:{:02d}", 70.0), ("{}:{:02d}", 4200.0)]
+)
+@pytest.mark.filterwarnings("ignore:Times as .* are read as hours and minutes")
+def test_clocks_go_on_after_a_day(tmp_path, table, text, step):
+    path = tmp_path / "a.csv"
+    seconds = 23 * 3600 + int(step) * np.arange(40)
+    times = [text.format(s // 3600, s // 60 % 60, s % 60) for s in seconds]
+    table.assign(Zeit=times).to_csv(path, index=False)
+    found = read(path)[0]["Zeit"]
+    assert_allclose(found.diff()[1:] / pd.Timedelta("1s"), step)
+    times[5] = None
+    lost = with_times(table.assign(Zeit=times), "Zeit", None, {}).rows["Zeit"]
+    assert lost.isna().sum() == 1
+    assert (lost.drop(5) == found.drop(5)).all()
+
+
 def test_tables_without_names_say_what_their_columns_are_called(tmp_path, table):
     path = tmp_path / "a.csv"
     table[NAMES[1:]].to_csv(path, index=False, header=False)
