@@ -29,6 +29,16 @@ _OPTIONS = (
         r"which tell their unit",
         "Give --time-unit where they are not",
     ),
+    (r"dates instead: pandas\.to_datetime\(.*?, unit='(\w+)'\)", r"--time-unit \1"),
+    (
+        r"Convert text of dates with pandas\.to_datetime, of numbers with "
+        r"pandas\.to_numeric",
+        "Write dates as 2026-03-04 10:15:00.05, or numbers",
+    ),
+    (r" \(pandas\.Series\.dt\.tz_localize, with ambiguous='infer'\)", ""),
+    (r"thousands=',' where it parts", "write them without where it parts"),
+    (r"pandas\.read_csv\(decimal=','\)", "give --decimal ','"),
+    (r"pandas\.read_csv\(.*?thousands=.*?\)", "write them without"),
     (r"`tol`", "`--levels`"),
     (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
     (r"`(operating|sampling)_(point|time)`", r"`--\1-\2`"),
