@@ -47,9 +47,10 @@ _NOISE = 10.0  # standard deviations over which a parameter moves by more than n
 _SURE = 1e3
 
 # Where no form is true: the first, or one of the others that meets points left out, so
-# many at least, with less than this share of its squared errors of most parameters.
+# many at least, with less than this share of its squared errors, over the parameters.
 _CURVES = (("pchip", "linear"), ("cubic", "linear"), ("pchip", "log"), ("cubic", "log"))
 _SMOOTHER, _LEFT_OUT = 0.7, 3
+_FAR_LESS = 1e-3  # share of the errors below which a parameter says no more
 # Mean squared error, in the spread, of what must not be met worse; but for this share.
 _FORESEEN, _FEW = 0.02, 0.1
 
@@ -65,7 +66,7 @@ class AutoLPV(Interpolator):
     Where none is left, or the covariances are not known, the interpolation follows the
     points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
     the logarithms of the scheduling variables, meets points that are left out, three at
-    least, with clearly smaller errors of most parameters.
+    least, with clearly smaller errors (in the geometric mean over the parameters).
 
     Parameters
     ----------
@@ -268,9 +269,11 @@ def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV
     errors = _errors_left_out(curves, kappa, points)
     if errors.shape[1] < _LEFT_OUT or not errors[0].any():
         return names[0], curves[0]
-    # of every parameter, relative to the first: noise of some hides no law of others
+    # of every parameter, relative to the first, and their geometric mean: noise of some
+    # hides no law of others
     each = errors.sum(axis=1)
-    shares = np.median(each[:, each[0] > 0.0] / each[0, each[0] > 0.0], axis=1)
+    ratios = each[:, each[0] > 0.0] / each[0, each[0] > 0.0]
+    shares = np.exp(np.mean(np.log(np.maximum(ratios, _FAR_LESS)), axis=1))
     seen = each[0] < _FORESEEN * errors.shape[1]
     worse = np.sum(each[:, seen] > _FORESEEN * errors.shape[1], axis=1)
     allowed = worse <= _FEW * np.count_nonzero(seen)
