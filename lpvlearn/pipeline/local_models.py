@@ -365,6 +365,14 @@ def _drifting_alike(
     if not any(doubtful) and len(models) == len(found):
         return found
     drifting = clone(local).set_params(offset="linear")
+    lasting = [k for k, m in enumerate(found) if m is not None and m.result.lasts]
+    first = tried(drifting, lasting) if lasting else found
+    first = [first[k] if k in lasting else done for k, done in enumerate(found)]
+    for k in lasting:  # where a drift is no help to one of them it is to none
+        one = first[k]
+        if one is not None and one.result.lasts:
+            if _own_order(one.result) <= _common_order(models):
+                return found
 
     def drifts(known: list[Done | None], highest: float) -> list[Done | None]:
         """All points with drifts; anew where they are not, or have more states."""
@@ -378,7 +386,7 @@ def _drifting_alike(
         new = tried(drifting, again) if again else known
         return [new[k] if k in again else done for k, done in enumerate(known)]
 
-    others = drifts(found, np.inf)
+    others = drifts(first, np.inf)
     with_them = [done.result for done in others if done is not None]
     if not with_them:
         return found

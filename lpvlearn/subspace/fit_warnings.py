@@ -228,6 +228,11 @@ def tell_of_feedback(
     )
     if not feedback.shown:
         what = "The data seem to come from a closed loop. "
+    elif feedback.soon:
+        what += (
+            "Or samples are means (as of pandas' resample().mean()) over times within "
+            "which inputs move, which the next ones tell: keep single samples then. "
+        )
     loop = choices.feedthrough is True and feedback.instantaneous
     within = (
         "The input answers outputs within the sample, and these do not answer it (p = "

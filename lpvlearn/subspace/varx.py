@@ -86,6 +86,8 @@ _OUTLYING, _MOST = 6.0, 0.95
 # lacks (of 480 records in open loop up to .09)
 _HIDES, _ANSWERS, _MUCH = 0.5, 0.3, 0.1
 
+_LITTLE = 0.2  # share of what the next inputs tell, of what those after these add
+
 _DEPENDENT = 1e-9  # part of a regressor below which it is rounding
 
 # Innovations, relative to the outputs, too small to do harm or to be told from rounding
@@ -106,6 +108,7 @@ class Feedback(NamedTuple):
     p_direct: float = 1.0  # of outputs on a straight line over inputs of the sample
     p_answer: float = 1.0  # of inputs on a straight line over outputs of the sample
     alone: bool = True  # whether there is a single input
+    soon: bool = False  # whether the inputs of the next sample tell nearly all of it
 
     @property
     def found(self) -> bool:
@@ -235,6 +238,13 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         first = 1 if within.p_value < _INSTANTANEOUS or calm is not None else 0
         of_most, curved = _of_most(windows, m, noisy, first, calm)
         found = max(found, of_most, key=lambda test: (test.p_value, test.share))
+    soon = False
+    if found.p_value < _LEVEL:
+        nearest = _basis(future[:m], rows[c : c + m], _FORESEEN)
+        left, later = (x - (x @ nearest) @ nearest.T for x in (y[noisy], future[m:]))
+        next_ones = _wilks(y[noisy], nearest, dof)
+        beyond = _wilks(left, _basis(later, rows[c + m :], _FORESEEN), dof - m)
+        soon = beyond.share < _LITTLE * next_ones.share
     p_direct = p_answer = 1.0
     if within.p_value < _INSTANTANEOUS and noisy.any():
         before = scaled_lstsq(whole.before.T, rows[:c].T, _DEPENDENT)[0]
@@ -251,6 +261,7 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         p_direct=p_direct,
         p_answer=p_answer,
         alone=m == 1,
+        soon=soon,
     )
 
 

@@ -1,6 +1,7 @@
 """The long autoregression and the test of feedback: exact, of right size and power."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
@@ -311,3 +312,27 @@ def test_chance_within_the_sample_is_no_answer_to_outputs(seed):
     pieces = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
     records = [Record.of(u[k], y[k] / y.std(), 1) for k in pieces if len(k) > 2]
     assert not find_feedback(records).found
+
+
+def test_means_over_samples_know_the_next_inputs():
+    """As of pandas' resample().mean(), of inputs that move meanwhile; not in a loop."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 1000), rng.integers(40, 300, 1000))
+    u = u[:40_000]
+    y = lfilter([0.0, 0.01], [1.0, -0.99], u)
+    y += 0.02 * y.std() * rng.standard_normal(len(u))
+    means = pd.DataFrame({"u": u, "y": y}).groupby(np.arange(len(u)) // 25).mean()
+    with pytest.warns(UserWarning) as told:
+        SubspaceLTI(sampling_time=1.0).fit(means[["u"]], means["y"])
+    assert any("Or samples are means" in str(warning.message) for warning in told)
+    x, before, table = 0.0, 0.0, []
+    for reference in np.repeat(rng.uniform(-1.0, 1.0, 80), 20):
+        force = reference - before
+        before = x + 0.1 * rng.standard_normal()
+        table.append((force, before))
+        x = 0.8 * x + 0.3 * force
+    forces, outputs = np.hsplit(np.array(table), 2)
+    with pytest.warns(UserWarning) as told:
+        SubspaceLTI(sampling_time=1.0).fit(forces, outputs)
+    messages = " ".join(str(warning.message) for warning in told)
+    assert "from a closed loop" in messages and "are means" not in messages
