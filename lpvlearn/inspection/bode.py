@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
+from ..metrics.scorers import unwrapped
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
 from .drawing import (
@@ -24,7 +25,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import check_model, models_of, places_of, unwrapped, with_others
+from .fitted import check_model, models_of, places_of, with_others
 from .frequency import (
     check_frequencies,
     frequency_label,

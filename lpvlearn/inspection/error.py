@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
+from ..metrics.scorers import unwrapped
 from ..models.frequencies import frequency_axis, nyquist_frequency
 from ..models.statespace import StateSpace
 from .drawing import ACCENT, INK, MUTED, drawable, legend_above, single_axes, tidy
-from .fitted import check_model, nearest_point, unwrapped
+from .fitted import check_model, nearest_point
 from .frequency import (
     check_frequencies,
     frequency_label,

@@ -9,13 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
+from ..metrics.scorers import unwrapped
 from ..models.statespace import StateSpace
 from .drawing import units_of, with_unit
-
-
-def unwrapped(estimator: Any) -> Any:
-    """The best estimator of a fitted search, else the estimator itself."""
-    return getattr(estimator, "best_estimator_", estimator)
 
 
 def models_of(

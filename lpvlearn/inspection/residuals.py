@@ -12,6 +12,7 @@ from scipy.stats import norm
 from ..data.alignment import align_outputs
 from ..data.experiments import Table, as_numbers, read_outputs
 from ..data.preparation import read_runs
+from ..metrics.scorers import unwrap
 from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
     Residuals,
@@ -34,7 +35,6 @@ from .drawing import (
     names_of,
     tidy,
 )
-from .fitted import unwrapped
 
 Array = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ class ResidualDisplay:
             too short.
         """
         check_kind(errors)
-        estimator, simulates = unwrapped(estimator), errors == "simulation"
+        (estimator, X), simulates = unwrap(estimator, X), errors == "simulation"
         if isinstance(estimator, SubspaceLTI):
             residuals = estimator._residuals(X, y, errors)
         elif simulates and hasattr(estimator, "predict_with_initial_state"):

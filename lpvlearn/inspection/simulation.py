@@ -17,7 +17,7 @@ from ..data.experiments import (
     read_outputs,
 )
 from ..data.timestamps import time_in_seconds
-from ..metrics.scorers import check_options, simulate
+from ..metrics.scorers import check_options, simulate, unwrap
 from ..metrics.scores import best_fit
 from .drawing import (
     ACCENT,
@@ -32,7 +32,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import units_for, unwrapped
+from .fitted import units_for
 
 Array = NDArray[np.float64]
 
@@ -248,7 +248,7 @@ class SimulationDisplay:
             is not known.
         """
         check_options(initial_state)
-        estimator = unwrapped(estimator)
+        estimator, X = unwrap(estimator, X)
         uncertainty = bool(whole("uncertainty", uncertainty, range(2)))
         if uncertainty and (
             initial_state != "rest" or not hasattr(estimator, "prediction_std")

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..data.experiments import as_numbers
+from ..metrics.scorers import unwrapped
 from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, drawable, single_axes, tidy, whole
-from .fitted import unwrapped
 
 _MOST_SHOWN = 10**6  # no picture shows more
 

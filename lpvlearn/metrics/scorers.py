@@ -185,38 +185,36 @@ vaf_scorer = make_vaf_scorer()
 # -- from an estimator and a table to simulated experiments ----------------------------
 
 
-def unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
-    """The simulating estimator within a search or pipeline, and its input."""
+def wrapped_by(estimator: Any) -> Any:
+    """What a fitted search found best, or the last step of a chain; None of others."""
     from sklearn.pipeline import Pipeline  # slow to import
 
-    if not hasattr(estimator, "predict"):
-        raise ValueError(
-            "`estimator` must be a fitted estimator with the method predict(X). Got "
-            f"{type(estimator).__name__}; compare_models takes state-space models."
-        )
-    while True:
-        if hasattr(estimator, "best_estimator_"):
-            estimator = estimator.best_estimator_
-        elif isinstance(estimator, Pipeline):
-            X = estimator[:-1].transform(X) if len(estimator) > 1 else X
-            estimator = estimator[-1]
-        else:
-            return estimator, X
+    if isinstance(estimator, Pipeline):
+        return estimator[-1]
+    return getattr(estimator, "best_estimator_", None)
+
+
+def unwrapped(estimator: Any) -> Any:
+    """The estimator within searches and chains, whose models can be shown."""
+    while (inner := wrapped_by(estimator)) is not None:
+        estimator = inner
+    return estimator
+
+
+def unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
+    """The simulating estimator within searches and chains, and its input."""
+    while (inner := wrapped_by(estimator)) is not None:
+        if len(getattr(estimator, "steps", ())) > 1:
+            X = estimator[:-1].transform(X)
+        estimator = inner
+    return estimator, X
 
 
 def owner_of_experiments(estimator: Any) -> Any:
     """Who knows the experiments: the estimator, or what it wraps; else None."""
-    from sklearn.pipeline import Pipeline
-
-    while not hasattr(estimator, "split_experiments"):
-        if hasattr(estimator, "best_estimator_"):
-            estimator = estimator.best_estimator_
-        elif isinstance(estimator, Pipeline):
-            estimator = estimator[-1]
-        elif hasattr(estimator, "regressor_"):
-            estimator = estimator.regressor_
-        else:
-            return None
+    while estimator is not None and not hasattr(estimator, "split_experiments"):
+        inner = wrapped_by(estimator)
+        estimator = getattr(estimator, "regressor_", None) if inner is None else inner
     return estimator
 
 
@@ -241,6 +239,11 @@ def simulate(estimator: Any, X: Any, y: Any, initial_state: str) -> Simulated:
 
     What lacks an input, and is not simulated therefore, counts as not measured.
     """
+    if not hasattr(estimator, "predict"):
+        raise ValueError(
+            "`estimator` must be a fitted estimator with the method predict(X). Got "
+            f"{type(estimator).__name__}; compare_models takes state-space models."
+        )
     y = align_outputs(X, y, estimator)
     measured, names = read_outputs(y)
     if initial_state == "rest":

@@ -14,6 +14,7 @@ from ..data.operating_points import neighbours
 from ..lpv.left_out import interpolated_without
 from ..lpv.lfr import scales
 from ..lpv.weighting import covariance_factor
+from ..metrics.scorers import unwrapped
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..validation import one_of
@@ -92,6 +93,7 @@ def suggest_operating_point(
     0.7
     """
     one_of("criterion", criterion, _CRITERIA)
+    pipeline = unwrapped(pipeline)
     if not isinstance(pipeline, LocalLPVPipeline):
         raise ValueError(
             "`pipeline` must be a fitted LocalLPVPipeline. Got "
