@@ -34,9 +34,9 @@ _ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW = 1.0, 1.5, 0.3, 4, 0.8
 UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
 NEAR = 0.1  # and one up to which what the others foresee is what the record tells
 
-# Difference of two models, in the largest gain, between which a line is a guess; and of
-# what two curves make of the middle between two points, where either is.
-_APART, _GUESS = 0.3, 0.5
+# Difference, in the largest gain, from which what is between two points is a guess: of
+# their two models, or of what two curves make of the middle (mostly twice the error).
+_GUESS = 0.3
 
 _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
@@ -163,7 +163,7 @@ def tell_of_two_points(
     k = int((kappa != kappa[0]).any(axis=1).argmax())
     one, other = models[0], models[k]
     change = min(changed(one, other, longest), changed(other, one, longest))
-    if change > _APART:
+    if change > _GUESS:
         warn(
             "with two operating points nothing tells of what is between them: the "
             "parameters run along straight lines, between models that differ by "
