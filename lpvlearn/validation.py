@@ -162,11 +162,12 @@ def number_shown(value: float, width: float = 0.0) -> str:
     >>> number_shown(101312.3456, width=30.0)
     '101312.35'
     """
-    if width > 0.0:
+    if 0.0 < width < math.inf:
         value = round(float(value), _OF_WIDTH - math.floor(math.log10(width)))
         return f"{value + 0.0:.12g}"
-    text = f"{value:.12g}"
-    return text if len(text) <= _SHORT or text.isdigit() else f"{value:.4g}"
+    text = f"{value + 0.0:.12g}"
+    whole = text.removeprefix("-").isdigit()
+    return text if len(text) <= _SHORT or whole else f"{value:.4g}"
 
 
 def squarable(name: str, array: NDArray[Any]) -> NDArray[Any]:

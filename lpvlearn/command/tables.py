@@ -398,10 +398,11 @@ def with_times(
         unit, since = unit or own, _unit_since_1970(values)
         if since is not None and unit in (None, since):
             values = pd.to_datetime(values, unit=since)
-            told = (
-                f"Times in column {column!r} are taken as {since} since 1970, from "
-                f"{values.min()}; --time-unit tells otherwise."
-            )
+            if own is not None or unit is None:
+                told = (
+                    f"Times in column {column!r} are taken as {since} since 1970, "
+                    f"from {values.min()}; --time-unit tells otherwise."
+                )
         elif unit is not None:
             values = values * TIME_UNITS[unit]
         elif _LATEST <= values.abs().max() < np.inf:

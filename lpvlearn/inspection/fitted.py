@@ -13,6 +13,8 @@ from ..metrics.scorers import unwrapped
 from ..models.statespace import StateSpace
 from .drawing import units_of, with_unit
 
+_STILL = 0.01  # part of its size by which a variable hardly moves
+
 
 def models_of(
     estimator: Any, kappa: float | ArrayLike | None = None
@@ -72,10 +74,12 @@ def _place(pipeline: Any, kappa: float | ArrayLike | None) -> NDArray[np.float64
 def nearest_point(pipeline: Any, kappa: float | ArrayLike | None) -> int:
     """Number of the operating point of a fitted pipeline that is nearest to `kappa`.
 
-    Every variable counts in its range, whatever its unit.
+    Every variable counts in its range, whatever its unit; one that hardly moves does
+    not.
     """
     distances = pipeline.operating_points_ - _place(pipeline, kappa)
-    span = np.ptp(distances, axis=0)
+    size = _STILL * np.abs(pipeline.operating_points_).max(axis=0)
+    span = np.maximum(np.ptp(distances, axis=0), size)
     scaled = distances / np.where(span > 0, span, 1.0)
     return int(np.argmin(np.linalg.norm(scaled, axis=1)))
 

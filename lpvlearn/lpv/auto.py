@@ -164,8 +164,14 @@ class AutoLPV(Interpolator):
             chosen = min(supported, key=lambda k: (bent[k], -dof[k], cost[k]))
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             proven = not free
-            if dof[chosen] <= 0:  # it meets any points; a common pole would not
-                poles = [k for k in supported if _has_shown_pole(k, found, points)]
+            n_places = len(np.unique(kappa, axis=0))
+            if n - dof[chosen] >= n_places * points.theta.shape[1]:
+                # it meets any points; a common pole would not
+                poles = [
+                    k
+                    for k in supported
+                    if _has_shown_pole(found[k], found, kappa, points)
+                ]
                 if poles:
                     chosen, proven = min(poles, key=lambda k: cost[k]), True
         if not proven:
@@ -227,15 +233,26 @@ def _is_parabola(form: PolynomialLPV | RationalLPV) -> bool:
 
 
 def _has_shown_pole(
-    k: int, found: Sequence[tuple[str, Any]], points: WeightedPoints
+    own: tuple[str, Any],
+    found: Sequence[tuple[str, Any]],
+    kappa: Array,
+    points: WeightedPoints,
 ) -> bool:
-    """Whether one pole explains how several parameters bend, far beyond their noise."""
-    form = found[k][1]
-    if getattr(form, "denominator", 0) != 1 or not noise_explains(form):
+    """Whether one pole explains how parameters bend, far beyond their noise.
+
+    Those that follow one function of any shape have one, as far as few points tell. But
+    that what moves is all proportional, to the inverse of a line, is no chance.
+    """
+    form, moving = own[1], np.flatnonzero(_moving(points))
+    if getattr(form, "denominator", 0) != 1 or points.covariance is None:
         return False
-    spare = np.count_nonzero(_moving(points)) * (len(points.theta) - form.rank_)
+    if len(moving) < 2:  # of three values of one a line is found too easily
+        return False
     straight = next(f for name, f in found if name == f"polynomial {form.degree}")
-    return bool(spare >= len(form.denominator_) and straight.chi2_ > _SURE)
+    if not (straight.chi2_ > _SURE and noise_explains(form)):
+        return False
+    P, inverse = points.covariance[:, moving[:, None], moving], RationalLPV(0, 1)
+    return noise_explains(inverse.fit(kappa, points.theta[:, moving], None, P))
 
 
 def _moving(points: WeightedPoints) -> NDArray[np.bool_]:
@@ -243,8 +260,10 @@ def _moving(points: WeightedPoints) -> NDArray[np.bool_]:
     spread = np.ptp(points.theta, axis=0)
     if points.whitening is None or points.covariance is None:
         return spread > 0.0
-    variance = np.mean(np.diagonal(points.covariance, axis1=1, axis2=2), axis=0)
-    return np.asarray(spread > _NOISE * np.sqrt(variance))
+    variance = np.diagonal(points.covariance, axis1=1, axis2=2)
+    known = np.isfinite(variance)
+    total = np.sum(np.where(known, variance, 0.0), axis=0)
+    return np.asarray(spread > _NOISE * np.sqrt(total / np.maximum(known.sum(0), 1)))
 
 
 def _foresees(

@@ -29,8 +29,9 @@ _TERMS = ("total", "tensor")
 # either side: a sweep overshoots the outermost of the points. Nor is it smaller there
 # than the second share of its largest value. The next pair where with those before no
 # function is plausible: the pole of a length, or a mass, is where that is zero, and
-# squares of lengths from one to twenty are small.
-_LIMITS = (0.1, 0.02), (0.02, 0.02), (0.02, 0.002)
+# squares of lengths from one to twenty are small at that end.
+_LEAST = 0.02
+_LIMITS = (0.1, _LEAST), (0.02, _LEAST), (0.02, 0.002)
 
 _EXACT = 1e-6  # mean square in the spread of values that are the function's own
 
@@ -98,7 +99,8 @@ class RationalLPV(Interpolator):
     The denominator is positive, 0.02 of its largest value at least, within the range
     of the points and a margin of 10 % of its width on either side. Where no such
     function is plausible by the covariances, or without these meets the points, the
-    margin is 2 %, and at last 0.002 of its largest value. Beyond there may be a pole.
+    margin is 2 %, and at last 0.002 of its largest value will do at the border. Beyond
+    there may be a pole.
 
     References
     ----------
@@ -144,6 +146,7 @@ class RationalLPV(Interpolator):
         phi = self._terms(kappa, self.powers_)
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
         limits = [self._limit(kappa, *limit) for limit in _LIMITS]
+        limits = limits if psi.shape[1] else limits[:1]  # for no denominator
         alike, plausible = points.unweighted(), None
         for limit in limits:
             found = fit_rational(phi, psi, limit, points)
@@ -186,7 +189,9 @@ class RationalLPV(Interpolator):
     def _limit(self, kappa: Array, margin: float, least: float) -> _Limit:
         """Where the denominator must not vanish, and how small it may be there."""
         places = _places(self.scheduling_range_, kappa, margin)
-        return _Limit(self._terms(places, self.denominator_powers_)[:, 1:], least)
+        ends = (places == places.min(axis=0)) | (places == places.max(axis=0))
+        psi = self._terms(places, self.denominator_powers_)[:, 1:]
+        return _Limit(psi, ends.any(axis=1), least)
 
     def _carried(self, outer: Array, kappa: Array) -> Array:
         psi = self._terms(kappa, self.denominator_powers_)
@@ -218,12 +223,18 @@ class _Limit(NamedTuple):
     """What a denominator must keep."""
 
     places: Array  # (n_places, n_denominator_terms - 1): its terms but for its constant
+    border: NDArray[np.bool_]  # (n_places,)
     least: float  # of its largest value at all of these
 
     def allows(self, d: Array) -> bool:
-        """Whether a denominator, without its constant 1, stays so large."""
+        """Whether a denominator, without its constant 1, stays so large.
+
+        Small it may be towards an end, as the square of a length is; not in between.
+        """
         below = 1.0 + self.places @ d
-        return bool(below.min() >= self.least * below.max())  # False of NaN
+        share = below.min() / below.max() if below.max() > 0.0 else -1.0
+        at_end = self.border[np.argmin(below)]
+        return bool(share >= (self.least if at_end else _LEAST))  # False of NaN
 
 
 def fit_rational(

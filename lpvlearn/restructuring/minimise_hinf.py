@@ -282,9 +282,8 @@ def _from_least_squares(
     many = len(fits[0].x) >= _MANY
     near = len(starts) == 1 and fits[0].relative_error <= _NEAR and not many
     used, history = 0, []
-    if near and solver is minimax_sqp:
-        most = min(_AT_ONCE, max_iter)
-        end, result, floor = _ended(starts[0], solver, max_iter=most, **options)
+    if near and solver is minimax_sqp and max_iter > _AT_ONCE:
+        end, result, floor = _ended(starts[0], solver, max_iter=_AT_ONCE, **options)
         used, history = result.n_iter, result.history
         if result.converged and result.stationarity <= _STATIONARY:
             there = _ended(end, solver, max_iter=0, **options)[1]  # in its own metric

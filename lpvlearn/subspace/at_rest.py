@@ -49,14 +49,28 @@ def from_rest(samples: Samples, free: LocalFit, like: LocalFit | None) -> AtRest
     stand = stands(pairs)
     if stand is None and said:  # where it is not to be seen
         stand = Stands(np.array([first_inputs(u) for u, _ in pairs]), False)
+    pulses = None if stand is not None and stand.seen else pulsed(pairs)
     found = [
         one
-        for how in (stand, pulsed(pairs))
+        for how in (stand, pulses)
         if how is not None and (one := _at(how, samples, free)) is not None
     ]
-    return min(
-        found, key=lambda one: one.fitted.evidence.one_step.criterion, default=None
-    )
+    costs = [one.fitted.evidence.one_step.criterion for one in found]
+    as_likely = [
+        one
+        for one, cost in zip(found, costs, strict=True)
+        if cost <= min(costs) + ALIKE
+    ]
+    # A step after one sample is as well an impact on another plant, of which most acts
+    # at once; and an impact a step of one that has next to no static gain.
+    return min(as_likely, key=lambda one: _direct(one.fitted), default=None)
+
+
+def _direct(fitted: LocalFit) -> float:
+    """Which part of the static gain acts at once, in the units of the samples."""
+    model = fitted.evidence.state_space(fitted.model, 1.0)
+    gain = np.linalg.norm(model.dc_gain())
+    return float(np.linalg.norm(model.D) / gain) if gain > 0.0 else np.inf
 
 
 def _at(stand: Stands, samples: Samples, free: LocalFit) -> AtRest | None:

@@ -245,6 +245,7 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         next_ones = _wilks(y[noisy], nearest, dof)
         beyond = _wilks(left, _basis(later, rows[c + m :], _FORESEEN), dof - m)
         soon = beyond.share < _LITTLE * next_ones.share
+        soon &= within.p_value < _INSTANTANEOUS  # means know the inputs they are over
     p_direct = p_answer = 1.0
     if within.p_value < _INSTANTANEOUS and noisy.any():
         before = scaled_lstsq(whole.before.T, rows[:c].T, _DEPENDENT)[0]

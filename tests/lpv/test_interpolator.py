@@ -112,8 +112,8 @@ def test_covariances_of_another_shape_are_refused(interpolator, shape):
 @pytest.mark.parametrize("interpolator", ALL)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, "singular"])
 def test_one_covariance_that_is_not_known_leaves_all_out(interpolator, bad):
-    P = np.tile(1e-4 * np.eye(2), (7, 1, 1))
-    P[3] = 1e-4 * np.ones((2, 2)) if bad == "singular" else np.diag([bad, bad])
+    P = np.tile(1e-6 * np.eye(2), (7, 1, 1))  # with which no form is plausible
+    P[3] = 1e-6 * np.ones((2, 2)) if bad == "singular" else np.diag([bad, bad])
     theta = THETA + 0.1 * np.random.default_rng(1).normal(size=THETA.shape)
     between = np.linspace(-1, 2, 21)[:, None]
     with_them = interpolator().fit(KAPPA, theta, covariance=P)

@@ -176,3 +176,19 @@ def test_squares_of_lengths_over_a_wide_range_are_found(longest, known):
     model = RationalLPV(1, 2)
     model.fit(length, truth(length), covariance=P if known else None)
     np.testing.assert_allclose(model.predict(between), truth(between), rtol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_pole_is_near_between_points(seed):
+    """Steps over points ever farther apart: a form that nearly has one there."""
+    rng = np.random.default_rng(seed)
+    kappa = np.geomspace(0.3, 8.0, 10)[:, None]
+    steps = np.tanh((kappa - [6.8, 7.1, 6.2]) / [0.4, 0.4, 0.9])
+    theta = steps + 1e-3 * rng.standard_normal(steps.shape)
+    P = np.tile(1e-6 * np.eye(3), (10, 1, 1))
+    for degree in (2, 3):
+        model = RationalLPV(degree, 2).fit(kappa, theta, covariance=P)
+        fine = np.linspace(0.3, 8.0, 2000)[:, None]
+        below = model._terms(fine, model.denominator_powers_) @ model.denominator_
+        at_end = below[[0, -1]].min() == below.min()
+        assert below.min() >= (0.002 if at_end else 0.02) * below.max()

@@ -288,3 +288,17 @@ def test_a_record_that_is_cut_within_an_impact_is_in_motion():
     model = SubspaceLTI(1).fit(u[300:], y[300:])
     assert model.initial_states_.any()
     assert abs(model.lti_.poles().real.item() - 0.95) < 0.01
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_step_after_one_sample_is_no_impact(seed):
+    """As likely as an impact, but only with a feedthrough that answers it."""
+    u = np.full((150, 1), 3.0)
+    u[0] += 1.5
+    plant = StateSpace(0.93, 1.0, 1.0, None, 1.0)
+    y = plant.simulate(u - u[0]) + plant.dc_gain() * u[0]
+    y += 0.01 * np.random.default_rng(seed).standard_normal(y.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        model = SubspaceLTI(1, sampling_time=1.0).fit(u, y)
+    assert abs(model.lti_.dc_gain() / plant.dc_gain() - 1.0) < 0.02
