@@ -261,6 +261,7 @@ def test_progress_goes_to_stderr_only(spring, capsys):
     assert "local models" in captured.err and "restructuring" in captured.err
 
 
+@pytest.mark.filterwarnings("ignore:any 3 points lie on a form")
 @pytest.mark.filterwarnings("ignore:The (identified )?model")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 def test_failure_names_its_point_and_can_be_skipped(spring):
