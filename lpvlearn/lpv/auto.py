@@ -95,7 +95,9 @@ class AutoLPV(Interpolator):
     A rational form, or a polynomial of a higher degree than these, with more than half
     as many coefficients as there are values must foresee points that are left out,
     within the range of the others, as well as interpolation does; a rational form
-    better.
+    better. A polynomial that meets any points, as a parabola does three, gives way to
+    a pole where all that moves (two parameters at least) is proportional to the inverse
+    of a straight line, as what is divided by one mass or length is.
 
     If a form is true, its chi-square is about its degrees of freedom. A form whose
     chi-square is more than four times that (and no chance, for few degrees of freedom)

@@ -37,7 +37,8 @@ class AtRest(NamedTuple):
 def from_rest(samples: Samples, free: LocalFit, like: LocalFit | None) -> AtRest | None:
     """The model of experiments that begin at a stand, if as likely as the `free` one.
 
-    Or likelier than that of experiments which are said to begin at rest, at inputs of
+    At their first inputs, or at those that they come back to after an impact. Or
+    likelier than that of experiments which are said to begin at rest, at inputs of
     zero. Else others `like` them tell how these begin.
     """
     pairs, choices, _ = samples
