@@ -365,14 +365,10 @@ def _drifting_alike(
     if not any(doubtful) and len(models) == len(found):
         return found
     drifting = clone(local).set_params(offset="linear")
-    lasting = [k for k, m in enumerate(found) if m is not None and m.result.lasts]
-    first = tried(drifting, lasting) if lasting else found
-    first = [first[k] if k in lasting else done for k, done in enumerate(found)]
-    for k in lasting:  # where a drift is no help to one of them it is to none
-        one = first[k]
-        if one is not None and one.result.lasts:
-            if _own_order(one.result) <= _common_order(models):
-                return found
+
+    def anew(known: list[Done | None], again: Sequence[int]) -> list[Done | None]:
+        new = tried(drifting, again) if again else known
+        return [new[k] if k in again else done for k, done in enumerate(known)]
 
     def drifts(known: list[Done | None], highest: float) -> list[Done | None]:
         """All points with drifts; anew where they are not, or have more states."""
@@ -383,9 +379,14 @@ def _drifting_alike(
             or done.result.n_trend < 2
             or _own_order(done.result) > highest
         ]
-        new = tried(drifting, again) if again else known
-        return [new[k] if k in again else done for k, done in enumerate(known)]
+        return anew(known, again)
 
+    lasting = [k for k, m in enumerate(found) if m is not None and m.result.lasts]
+    first = anew(found, lasting)
+    order = _common_order(models) if models else 0
+    for one in [first[k] for k in lasting]:
+        if one is not None and one.result.lasts and _own_order(one.result) <= order:
+            return found  # where a drift is no help to one of them it is to none
     others = drifts(first, np.inf)
     with_them = [done.result for done in others if done is not None]
     if not with_them:
@@ -399,7 +400,6 @@ def _drifting_alike(
         return found
     if not models:
         return others
-    order = _common_order(models)
     better = sum(_cost(m, order) - _cost(m, _own_order(m)) for m in models)
     for one, other in zip(found, with_them, strict=True):
         better += one.result.criterion - other.criterion if one is not None else 0.0

@@ -38,14 +38,14 @@ def standing(u: Array) -> int:
     """
     if not len(u):
         return 0
-    n = int(_left(u, len(u)).argmax())
+    n = int(_left(u, u[0]).argmax())
     return n if n >= _STANDING else 0
 
 
-def _left(u: Array, n: int) -> NDArray[np.bool_]:
-    """Which of the first n samples are far from the first one, by the range of all."""
+def _left(u: Array, level: Array) -> NDArray[np.bool_]:
+    """Which samples are far from a level, by the range of all."""
     with np.errstate(over="ignore"):
-        far = np.abs(u[:n] - u[0]) > _STILL * np.ptp(u, axis=0)
+        far = np.abs(u - level) > _STILL * np.ptp(u, axis=0)
     return np.asarray(far.any(axis=1))
 
 
@@ -106,7 +106,7 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     for u, y in records:
         moves = moves_of(u)
         n = int(moves[0]) + 1 if len(moves) else 0
-        if not n or _left(u, n).any():
+        if not n or _left(u, u[0])[:n].any():
             return None  # they go on slowly
         shown = n >= _STANDING and n > _held_again(moves)  # not as they go on to do
         size = np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
@@ -136,7 +136,7 @@ def pulsed(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     levels, soon = [], False
     for u, _ in records:
         level = np.median(u, axis=0)
-        away = (np.abs(u - level) > _STILL * np.ptp(u, axis=0)).any(axis=1)
+        away = _left(u, level)
         n_pulses = np.count_nonzero(np.diff(away.astype(int), prepend=0) > 0)
         if n_pulses > _SELDOM or np.mean(away) > _BRIEF:
             return None
