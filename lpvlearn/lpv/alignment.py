@@ -39,6 +39,7 @@ from scipy.optimize import least_squares
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
+from ..models.scheduling_range import in_range_of_points
 from ..models.statespace import StateSpace
 from ..systems.balancing import gramian_factor
 
@@ -105,8 +106,7 @@ def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
     From the point in the middle outward, or from the one farthest outside; the
     neighbour of point k is ``parents[k]``.
     """
-    span = np.ptp(kappa, axis=0)
-    scaled = (kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0)
+    scaled = in_range_of_points(kappa)
     tree = minimum_spanning_tree(cdist(scaled, scaled) + _APART)
     if outward:
         away = np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)

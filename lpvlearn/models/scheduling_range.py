@@ -31,3 +31,9 @@ def to_unit(kappa: Array, scheduling_range: Array) -> Array:
     """Scheduling values mapped linearly from their range to [-1, 1]."""
     low, high = domains(scheduling_range)
     return (2 * kappa - (low + high)) / (high - low)
+
+
+def in_range_of_points(kappa: Array) -> Array:
+    """Points in units of the range that they span, from 0 to 1; 0 of a constant one."""
+    span = np.ptp(kappa, axis=0)
+    return np.asarray((kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0))

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from ..lpv.alignment import spanning_tree
+from ..models.scheduling_range import in_range_of_points
 from ..restructuring.problem import RestructuringProblem
 from ..structures.interchanges import distance, interchanges, known_before
 from ..structures.structure import GrayBoxStructure
@@ -243,7 +244,7 @@ def smoothest_family(
     that. Of two that differ at all points the less `far` from what is known is taken,
     if something is.
     """
-    x = _scaled(kappa)
+    x = in_range_of_points(kappa) - 0.5
     order = spanning_tree(kappa, outward=False)[0].astype(np.intp)
     columns = np.flatnonzero(
         np.any([np.ptp(rows, axis=0) > 0 for rows in candidates], axis=0)
@@ -305,12 +306,6 @@ def _changes(
         noise = np.sqrt(V[k][families[:, k]] + V[k][c])
         changes.append(gap > np.maximum(_TELLS, _DEVIATIONS * noise))
     return changes
-
-
-def _scaled(kappa: Array) -> Array:
-    """The points in units of their range, which is from -1/2 to 1/2."""
-    span = np.ptp(kappa, axis=0)
-    return np.asarray((kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0) - 0.5)
 
 
 def _units(candidates: Sequence[Array], columns: Choices) -> tuple[Array, Array]:

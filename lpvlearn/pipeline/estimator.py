@@ -631,8 +631,11 @@ list, default=None
             form = getattr(self.interpolator_, "best_estimator_", None)
             if form is not None:
                 tell_of_two_points(self.structured_models_, kappa, longest)
-            saturated = not moving and getattr(form, "degrees_of_freedom_", 1) <= 0
-            if isinstance(form, SplineLPV) or (saturated and len(kappa) > 2):
+            n_places = len(np.unique(kappa, axis=0))
+            repeated = (len(kappa) - n_places) * found.theta.shape[1]
+            dof = getattr(form, "degrees_of_freedom_", np.inf)
+            saturated = not moving and dof <= repeated
+            if isinstance(form, SplineLPV) or (saturated and n_places > 2):
                 tell_unforeseen(
                     self.lpv_,
                     self.structured_models_,

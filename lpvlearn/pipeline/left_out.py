@@ -96,7 +96,8 @@ def tell_unforeseen(
     most = errors and np.median([*errors.values()]) > limit
     if often or most:
         known = (
-            f"any {len(kappa)} points lie on a form of as many coefficients"
+            f"any {len(np.unique(kappa, axis=0))} points lie on a form of as many "
+            "coefficients"
             if saturated
             else "no form fits the parameters over the operating points"
         )

@@ -22,6 +22,7 @@ from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
 from ..lpv.left_out import interpolated_without, takes_covariance, values_left_out
 from ..lpv.model import LPVStateSpace
+from ..models.scheduling_range import in_range_of_points
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
@@ -424,8 +425,7 @@ def _help_neighbours(
     """
     fitted = list(fitted)
     better: list[Done | None] = [None] * len(fitted)
-    span = np.ptp(kappa, axis=0)
-    scaled = kappa / np.where(span > 0, span, 1.0)
+    scaled = in_range_of_points(kappa)
     distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
     tried: set[tuple[int, bytes]] = set()
     for _ in range(_SWEEPS):

@@ -128,11 +128,18 @@ def test_parameters_are_those_of_the_canonical_restructurer():
     np.testing.assert_allclose(model.parameters_std_, other.parameters_std_, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_a_parabola_through_any_three_points_is_told():
     """Of the canonical form, of which nothing else is known."""
     X, y = tables(pendulum, 3)
     with pytest.warns(UserWarning, match="any 3 points lie on a form .* not foresee"):
         pipeline(GrayBoxRestructurer()).fit(X, y)
+    again = X.assign(point=X["kappa"] + 1.0)  # each of them measured twice
+    X, y = pd.concat([X.assign(point=X["kappa"] - 1.0), again]), np.concatenate([y, y])
+    twice = pipeline(GrayBoxRestructurer(), operating_point="point")
+    with pytest.warns(UserWarning, match="any 3 points lie on a form .* not foresee"):
+        twice.fit(X.assign(experiment=X["point"]), y)
+    assert len(twice.operating_points_) == 6
     X, y = tables(slight_pendulum, 3)
     assert pipeline(GrayBoxRestructurer()).fit(X, y).interpolator_.form_
 
