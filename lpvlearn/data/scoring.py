@@ -94,10 +94,13 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
     if not hasattr(estimator, "predict_with_initial_state"):
         return
     measured = read_outputs(y)[0]
+    experiments = estimator.split_experiments(X)
+    if not any(_may_gain(measured[rows], simulated[rows]) for rows in experiments):
+        return
     with collected(), np.errstate(all="ignore"):  # predict has said what there is
         estimated = read_outputs(estimator.predict_with_initial_state(X, y))[0]
     n_late = int(np.sum(getattr(estimator, "input_delay_", 0)))
-    for rows in estimator.split_experiments(X):
+    for rows in experiments:
         known = np.where(np.isnan(estimated[rows]), np.nan, measured[rows])
         if _starts_in_motion(known, simulated[rows], estimated[rows], n_late):
             warn(
@@ -109,6 +112,17 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
                 "transient, make_bft_scorer(burn_in=...)."
             )
             return
+
+
+def _may_gain(measured: Array, simulated: Array) -> bool:
+    """Whether errors of an experiment are so large that a transient may matter."""
+    known = ~np.isnan(measured)
+    error = np.where(known, measured - simulated, 0.0)
+    with np.errstate(all="ignore"):
+        mean = measured.sum(axis=0, where=known) / known.sum(axis=0)
+        size = np.linalg.norm(np.where(known, measured - mean, 0.0), axis=0)
+        shares = np.linalg.norm(error, axis=0) / size
+        return bool(100.0 * np.mean(np.minimum(shares, 1.0)) > _GAIN)
 
 
 def _starts_in_motion(
