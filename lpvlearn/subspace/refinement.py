@@ -14,10 +14,10 @@ freedom that a change of basis leaves is removed by taking the minimum-norm step
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from ..systems.least_squares import column_scale, scaled_lstsq
 from .records import Record, output_energy
@@ -47,9 +47,14 @@ _STABLE_RADIUS = 1.0 - 1e-8  # of the circle that steps keep all poles in, once 
 
 # Damping of the steps tried in turn, relative to the largest squared singular value:
 # the whole step, then from the hardly determined directions to ever more of them, at
-# last down the gradient. A valley is followed by steps that leave only the former out.
+# last down the gradient.
 _DAMPINGS = (0.0, 1e-4, 1e-2, 1e-1, 1.0)
-_FINE_DAMPINGS = (0.0, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
+
+# Along a valley the damping is that of the last step, raised by growing factors where
+# the step fails (Nielsen), lowered where it gains about what it promised.
+_FIRST, _LEAST, _MOST = 1e-14, 1e-17, 1.0
+_MORE, _LESS = 4.0, 0.1
+_AS_PROMISED, _FAR_LESS = 0.75, 0.25  # shares of a promised gain
 
 
 def refine_simulation(
@@ -81,8 +86,7 @@ def refine_simulation(
         return model
     energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
-    dampings = _FINE_DAMPINGS if patient else _DAMPINGS
-    level = 0  # of the damping: a valley is not left at the next step
+    damping = 0.0
     for _ in range(max_iter or (_MANY if patient else _MAX_ITER)):
         if model.loss <= ROUNDING * energy or model.blocks is None:
             return model
@@ -100,13 +104,15 @@ def refine_simulation(
         negligible = _NEGLIGIBLE * model.loss * rank / n_values
         if predicted <= negligible:
             return model
-        steps = _trial_steps(step, jacobian, residual, dampings[max(level - 1, 0) :])
+        tried = _rising(damping) if patient else _DAMPINGS
+        steps = _trial_steps(step, jacobian, residual, predicted, tried)
         improved = _accepted(model, records, free, steps)
         if improved is None:
             return model
-        tried, better = improved
-        level = max(level - 1, 0) + tried if patient else 0
-        miss = predicted - (model.loss - better.loss)
+        trial, better = improved
+        gain = model.loss - better.loss
+        damping = _next_damping(trial.damping, gain / trial.promised)
+        miss = predicted - gain
         model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
         if left <= negligible:
@@ -114,40 +120,76 @@ def refine_simulation(
     return model
 
 
+class _Trial(NamedTuple):
+    """A step that is tried, its damping, and the gain that it promises."""
+
+    step: Array
+    damping: float
+    promised: float
+
+
 def _accepted(
     model: Realization,
     records: Sequence[Record],
     free: Freedom,
-    steps: Iterable[Array],
-) -> tuple[int, Realization] | None:
-    """The first of ever shorter steps that reduces the error, and its number."""
+    trials: Iterable[_Trial],
+) -> tuple[_Trial, Realization] | None:
+    """The first of ever shorter steps that reduces the error, and its model."""
     radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
-    for number, trial_step in enumerate(steps):
-        moved = moved_model(model, trial_step, free)
+    for trial in trials:
+        moved = moved_model(model, trial.step, free)
         blocks = moved.blocks or ()
         if block_radius(blocks) > radius:
             continue
-        trial = block_fit(blocks, moved.C, records, free)
-        if trial.loss < model.loss:
-            return number, trial
+        found = block_fit(blocks, moved.C, records, free)
+        if found.loss < model.loss:
+            return trial, found
     return None
 
 
 def _trial_steps(
-    step: Array, jacobian: Array, residual: Array, dampings: Sequence[float]
-) -> Iterator[Array]:
-    """The whole step, where it is not to be damped, then damped ones.
+    step: Array,
+    jacobian: Array,
+    residual: Array,
+    predicted: float,
+    dampings: Iterable[float],
+) -> Iterator[_Trial]:
+    """The whole step, which promises the `predicted` gain, and damped ones.
 
-    These by normal equations, whose condition damping bounds: directions that the data
-    do not determine are damped away by the least of it.
+    With ``J = U diag(s) V^T`` of the Jacobian, its columns scaled, ``d = V diag(s /
+    (s^2 + damping max(s)^2)) U^T r``, without the directions that the data do not
+    determine.
     """
-    if dampings[0] == 0.0:
-        yield step
-    scale = column_scale(jacobian)
-    jacobian = jacobian / scale
-    gram, projected = jacobian.T @ jacobian, jacobian.T @ residual
-    largest = np.linalg.eigvalsh(gram)[-1]
+    parts: tuple[Array, ...] | None = None
     for damping in dampings:
-        if damping > 0.0:
-            damped = gram + damping * largest * np.eye(len(gram))
-            yield lapack.dposv(damped, projected)[1] / scale
+        if damping == 0.0:
+            yield _Trial(step, 0.0, predicted)
+            continue
+        if parts is None:
+            scale = column_scale(jacobian)
+            U, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+            known = s > UNDETERMINED * s[0]
+            share = (s[known] / s[0]) ** 2
+            parts = Vt[known].T / scale[:, None], (U.T @ residual)[known], s[known]
+        V, along, s = parts
+        kept = share / (share + damping)
+        promised = float(np.sum(along**2 * kept * (2.0 - kept)))
+        yield _Trial(V @ (kept * along / s), damping, promised)
+
+
+def _rising(damping: float) -> Iterator[float]:
+    """Dampings from one on, up to that of a step down the gradient."""
+    more = _MORE
+    while damping < _MOST:
+        yield damping
+        damping, more = max(more * damping, _FIRST), 2.0 * more
+    yield _MOST
+
+
+def _next_damping(damping: float, share: float) -> float:
+    """That of the next step, by the share of the promised gain that this one made."""
+    if share > _AS_PROMISED:
+        damping *= _LESS
+    elif share < _FAR_LESS:
+        damping = max(_MORE * damping, _FIRST)
+    return damping if damping >= _LEAST else 0.0

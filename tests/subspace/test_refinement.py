@@ -75,3 +75,28 @@ def test_steps_go_on_along_the_valley_of_lags_that_are_hardly_told_apart():
             for start in starts
         )
         assert far.loss < 1.001 * near.loss
+
+
+def test_a_valley_is_followed_with_the_damping_that_it_needs():
+    """Of two close pairs of poles; from lags, which must meet to become such pairs."""
+    A, free = modes(0.70 + 0.045j, 0.85 + 0.046j), freedom(2, 2)
+    starts = modes(0.55, 0.92, 0.843 + 0.0487j), modes(0.3, 0.5, 0.9, 0.95)
+    for seed, used in ((0, starts), (5, starts[:1])):
+        rng = np.random.default_rng(seed)
+        B, C = rng.standard_normal((4, 2)), rng.standard_normal((2, 4))
+        system = A, B, C, np.zeros((2, 2))
+        u = rng.standard_normal((3000, 2))
+        y = lti_response(*system, u)
+        y = y + 0.01 * y.std(axis=0) * rng.standard_normal(y.shape)
+        records = [Record(u.T.copy(), y.T.copy())]
+        near, *far = (
+            refine_simulation(
+                simulation_fit(*start, records, free), records, free, patient=True
+            )
+            for start in (
+                (A, C),
+                *((A0, rng.standard_normal((2, 4))) for A0 in used),
+            )
+        )
+        for model in far:
+            assert model.loss < (1.0 + 1e-4) * near.loss
