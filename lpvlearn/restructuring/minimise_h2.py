@@ -15,6 +15,7 @@ from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks, shortest_in_hull
+from ..systems.balancing import in_even_units
 from .coordinates import metric_coordinates
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, remembering
@@ -46,14 +47,12 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
     structure, n, p, w = system.structure, system.n, system.n_outputs, system.weight
     N = n + len(system.target.A)
     As, Bs, Cs, Ds = system.realisation(theta)
-    if system.dt is None:
-        P = solve_continuous_lyapunov(As, -Bs @ Bs.T)
-        Q = solve_continuous_lyapunov(As.T, -Cs.T @ Cs)
+    continuous = system.dt is None
+    P, Q = _gramian(As, Bs, continuous), _gramian(As.T, Cs.T, continuous)
+    if continuous:
         J, gA, gB, gC = np.trace(Cs @ P @ Cs.T), 2 * Q @ P, 2 * Q @ Bs, 2 * Cs @ P
         gDs = np.zeros_like(Ds)
     else:
-        P = solve_discrete_lyapunov(As, Bs @ Bs.T)
-        Q = solve_discrete_lyapunov(As.T, Cs.T @ Cs)
         J = np.trace(Cs @ P @ Cs.T) + np.sum(Ds**2)
         gA, gB, gC = 2 * Q @ As @ P, 2 * Q @ Bs, 2 * Cs @ P
         gDs = 2 * Ds
@@ -66,6 +65,20 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
     gS[n:, :n], gS[n:, n:] = gCe[:, :n], gDe
     gradient = np.tensordot(structure.jacobian(theta), gS, axes=2)
     return float(max(J, 0.0)), gradient
+
+
+def _gramian(A: Array, B: Array, continuous: bool) -> Array:
+    """The controllability Gramian P, solved for in even units of the states.
+
+    In others poles of a fast system would seem to lie on the axis.
+    """
+    even, units = in_even_units(A)
+    B = B / units[:, None]
+    if continuous:
+        P = solve_continuous_lyapunov(even, -B @ B.T)
+    else:
+        P = solve_discrete_lyapunov(even, B @ B.T)
+    return np.asarray(P * units[:, None] * units)
 
 
 def minimise_h2(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.error_system import ErrorSystem, Target
@@ -78,6 +79,23 @@ def test_restructurer_minimises_the_h2_norm():
     for _ in range(20):
         near = fitted.params_ * (1 + 1e-3 * rng.normal(size=3))
         assert squared_h2(system, near)[0] >= J * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e-5, 1e-2, 1e3, 1e6])
+def test_h2_is_the_same_in_any_unit_of_time(unit):
+    """`unit` of the seconds of a spring; its parameters are powers of a rate."""
+    spring = GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
+    )
+    box = StateSpace([[0, 1], [-40, -1.2]], [[0.15], [30]], [[1, 0.01]])
+    scaled = StateSpace(box.A / unit, box.B / unit, box.C)
+    rates = {"k": unit**2, "c": unit, "b": unit**2}
+    restructurer = GrayBoxRestructurer(spring, norm="h2")
+    with pytest.warns(ConvergenceWarning, match="comes no nearer than 4.9 %"):
+        own = restructurer.fit_model(box).params_
+        other = restructurer.fit_model(scaled).params_
+    found = [rates[n] * x for n, x in zip(spring.parameter_names, other, strict=True)]
+    np.testing.assert_allclose(found, own, rtol=1e-6)
 
 
 def test_h2_recovers_exact_models_with_a_feedthrough_parameter():
