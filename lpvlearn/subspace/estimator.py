@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import replace
 from numbers import Integral
 from typing import Any, Self, cast
 
@@ -522,7 +521,8 @@ class SubspaceLTI(
     ) -> tuple[LocalFit, Simulator]:
         """The model of samples some of which are estimates: nothing is told of it."""
         with collected():
-            fitted = self._identify(experiments, choices, delay, Telling(), known)
+            silence = Telling(silent=True)
+            fitted = self._identify(experiments, choices, delay, silence, known)
         return fitted, self._simulator()
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
@@ -620,6 +620,8 @@ class SubspaceLTI(
         self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
         here = self._simulator()._replace(lti=self.lti_.with_input_delay(0))
         self.begun_state_ = here.begun_state(experiments)
+        if telling.silent:
+            return fitted
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -890,7 +892,7 @@ class SubspaceLTI(
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
         self.__dict__.pop("_stale", None)
-        self._evidence = replace(fitted.evidence, input_delay=delay)
+        self._evidence = fitted.evidence.beside(input_delay=delay)
         self.lti_ = self._evidence.state_space(fitted.model, step)
         self.input_delay_ = self.lti_.input_delay
         self.order_ = fitted.selection.order

@@ -7,9 +7,8 @@ drifts, shifts, rest at their beginning, a model of the closed loop.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data.preparation import check_excitation, remove_trends
 from .at_rest import from_rest, moved_back
@@ -29,6 +28,7 @@ from .noise_levels import as_given, by_own_noise
 from .one_fit import Samples, TooFewSamples
 from .oscillations import without_modes_of_few_lines, without_oscillations
 from .rivals import (
+    Doubt,
     believable,
     held_by_a_loop,
     may_be_held,
@@ -39,6 +39,8 @@ from .rivals import (
 from .rounded_inputs import without_rounding
 from .shifts import without_shifts
 from .trends import with_trends
+
+Array = NDArray[np.float64]
 
 
 def fit_samples(
@@ -68,12 +70,9 @@ def fit_samples(
     fitted = of_drifting_noise(samples, fitted) or fitted
     samples, fitted, turns = without_oscillations(samples, fitted)
     fitted = without_modes_of_few_lines(samples, fitted)
-    tell_of_logging(pairs, fitted, telling)
-    if fitted.selection.order:
-        tell_of_held_outputs(outputs, telling)
-        tell_of_limits(outputs, fitted, telling)
-    tell_of_contradiction(samples, fitted)
-    tell_of_input_spikes(samples, fitted)
+    if not telling.silent:
+        tell_of_logging(pairs, fitted, telling)
+        _tell_of_signals(outputs, samples, fitted)
     whole, rest, differ = samples, None, fitted.offsets.differ
     samples, fitted = without_shifts(samples, fitted)
     if samples is whole:
@@ -94,18 +93,10 @@ def fit_samples(
         fitted = held_by_a_loop(samples, fitted)
     elif may_share_noise(fitted, choices):
         fitted = with_shared_noise(samples, fitted)
-    feedback = fitted.feedback
-    if feedback is not None and feedback.found and "feedback" not in telling:
-        if feedback.shown or not fitted.model.D.any():
-            tell_of_feedback(feedback, fitted, choices, doubt, telling)
-        else:
-            tell_of_answers(feedback, telling)
-        if like is None and feedback.shown and not foreseen:
-            tell_of_lead(samples, fitted)
-    elif feedback is not None and feedback.may_be_answered and fitted.model.D.any():
-        tell_of_answers(feedback, telling)
+    if not telling.silent:
+        _tell_of_loop(samples, fitted, doubt, like)
     if len(turns) and fitted.method != "pbsid":
-        fitted = fitted._replace(evidence=replace(fitted.evidence, turns=turns))
+        fitted = fitted._replace(evidence=fitted.evidence.beside(turns=turns))
     if sizes is not None:
         fitted = as_given(fitted, sizes, constants_differ)
     if rest is not None:
@@ -113,3 +104,31 @@ def fit_samples(
     if detrend is not None:
         fitted = fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
     return fitted, samples
+
+
+def _tell_of_signals(outputs: list[Array], samples: Samples, fitted: LocalFit) -> None:
+    """Tell what the signals do that no sensor should, beside the model of them."""
+    if fitted.selection.order:
+        tell_of_held_outputs(outputs, samples.telling)
+        tell_of_limits(outputs, fitted, samples.telling)
+    tell_of_contradiction(samples, fitted)
+    tell_of_input_spikes(samples, fitted)
+
+
+def _tell_of_loop(
+    samples: Samples, fitted: LocalFit, doubt: Doubt | None, like: LocalFit | None
+) -> None:
+    """Tell where inputs answer the outputs, or seem to."""
+    _, choices, telling = samples
+    feedback = fitted.feedback
+    if feedback is None:
+        return
+    if feedback.found and "feedback" not in telling:
+        if feedback.shown or not fitted.model.D.any():
+            tell_of_feedback(feedback, fitted, choices, doubt, telling)
+        else:
+            tell_of_answers(feedback, telling)
+        if like is None and feedback.shown and not feedback.foreseen:
+            tell_of_lead(samples, fitted)
+    elif feedback.may_be_answered and fitted.model.D.any():
+        tell_of_answers(feedback, telling)

@@ -24,6 +24,7 @@ from ..data.experiments import Experiment
 from ..data.preparation import complete_runs, part_of
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
+from ..systems.least_squares import scaled_lstsq
 from .noise import expected_change, expected_noise, noise_of
 from .telling import Telling
 
@@ -204,7 +205,7 @@ def first_guess(runs: Sequence[Experiment]) -> list[Experiment]:
     for i in range(n_outputs):
         known = ~np.isnan(Y[:, i])
         k = _n_regressors(X[known], Y[known, i], n_inputs)
-        answers[:k, i] = np.linalg.lstsq(X[known, :k], Y[known, i], _RCOND)[0]
+        answers[:k, i] = scaled_lstsq(X[known, :k], Y[known, i], _RCOND)[0]
     return by_simulation(runs, [_lagged(u, n_lags) @ answers for u, _ in pairs])
 
 

@@ -19,9 +19,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,6 +186,15 @@ class Evidence:
             np.broadcast_to(self.input_delay, (m,)).astype(int),
             self.turns,
         )
+
+    def beside(self, **other: Any) -> Evidence:
+        """Of another `input_delay` or `turns`, with what is computed already.
+
+        Nothing of that depends on them.
+        """
+        evidence = replace(self, **other)
+        evidence.__dict__.update(self.__dict__ | evidence.__dict__)
+        return evidence
 
     def _gain(self) -> Array | None:
         """Innovation gain of the deterministic states, in the scale of the records."""

@@ -15,12 +15,14 @@ from ..exceptions import warn
 class Telling:
     """What was told, and how the columns of inputs and outputs are called.
 
-    Channels without names (None) are numbered, counted from 1.
+    Channels without names (None) are numbered, counted from 1. Where nobody is to hear
+    it (`silent`) what only tells need not be computed.
     """
 
     inputs: Sequence[Hashable] | None = None
     outputs: Sequence[Hashable] | None = None
     kinds: set[str] = field(default_factory=set)  # of warnings that were given
+    silent: bool = False
 
     def __contains__(self, kind: str) -> bool:
         return kind in self.kinds
