@@ -29,9 +29,11 @@ _TERMS = ("total", "tensor")
 # either side: a sweep overshoots the outermost of the points. Nor is it smaller there
 # than the second share of its largest value. The next pair where with those before no
 # function is plausible: the pole of a length, or a mass, is where that is zero, and
-# squares of lengths from one to twenty are small at that end.
+# squares of lengths from one to twenty are small at that end. At last the margin leaves
+# this share of the way to zero, however near that is.
 _LEAST = 0.02
 _LIMITS = (0.1, _LEAST), (0.02, _LEAST), (0.02, 0.002)
+_TO_ZERO = 0.5
 
 _EXACT = 1e-6  # mean square in the spread of values that are the function's own
 
@@ -99,8 +101,9 @@ class RationalLPV(Interpolator):
     The denominator is positive, 0.02 of its largest value at least, within the range
     of the points and a margin of 10 % of its width on either side. Where no such
     function is plausible by the covariances, or without these meets the points, the
-    margin is 2 %, and at last 0.002 of its largest value will do at the border. Beyond
-    there may be a pole.
+    margin is 2 %, and then 0.002 of its largest value will do at the border; at last
+    the margin is half the way to zero, where a variable has one sign and comes near it:
+    the pole of what is inverse to a mass, or to a time. Beyond there may be a pole.
 
     References
     ----------
@@ -145,7 +148,7 @@ class RationalLPV(Interpolator):
                 break
         phi = self._terms(kappa, self.powers_)
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
-        limits = [self._limit(kappa, *limit) for limit in _LIMITS]
+        limits = list(self._limits(kappa))
         limits = limits if psi.shape[1] else limits[:1]  # for no denominator
         alike, plausible = points.unweighted(), None
         for limit in limits:
@@ -177,16 +180,30 @@ class RationalLPV(Interpolator):
 
     def _set(self, coefficients: Array) -> None:
         numerator, d = np.split(coefficients, [self.numerator_.size])
-        if not self._limit(self.scheduling_range_, *_LIMITS[-1]).allows(d):
+        *_, widest = self._limits(self.scheduling_range_)
+        if not widest.allows(d):
             raise ValueError(
                 "`coefficients` must keep the denominator positive within the range "
-                f"of the points, {_LIMITS[-1][1]:g} of its largest value at least. Got "
+                f"of the points, {widest.least:.1g} of its largest value at least. Got "
                 f"{d.tolist()} beside its constant 1."
             )
         self.numerator_ = numerator.reshape(self.numerator_.shape)
         self.denominator_ = np.concatenate([[1.0], d])
 
-    def _limit(self, kappa: Array, margin: float, least: float) -> _Limit:
+    def _limits(self, kappa: Array) -> Iterator[_Limit]:
+        """What the denominator must keep: less where with that none is plausible."""
+        for margin, least in _LIMITS:
+            yield self._limit(kappa, margin, least)
+        near, far = np.sort(np.abs(self.scheduling_range_), axis=0)
+        signed = (np.prod(self.scheduling_range_, axis=0) > 0.0) & (near < far)
+        way = np.full(len(near), np.inf)
+        np.divide(_TO_ZERO * near, far - near, out=way, where=signed)
+        if (way < margin).any():
+            degree = self.denominator_powers_.sum(axis=1).max()
+            share = _TO_ZERO * _TO_ZERO * np.min((near / far)[way < margin])
+            yield self._limit(kappa, np.minimum(way, margin), min(least, share**degree))
+
+    def _limit(self, kappa: Array, margin: float | Array, least: float) -> _Limit:
         """Where the denominator must not vanish, and how small it may be there."""
         places = _places(self.scheduling_range_, kappa, margin)
         ends = (places == places.min(axis=0)) | (places == places.max(axis=0))
@@ -329,7 +346,7 @@ class _Search(NamedTuple):
         return found.x[np.argmin(found.cost)]
 
 
-def _places(scheduling_range: Array, kappa: Array, margin: float) -> Array:
+def _places(scheduling_range: Array, kappa: Array, margin: float | Array) -> Array:
     """Where the denominator must not vanish: the range and its margin, as a grid."""
     n = kappa.shape[1]
     levels = int(_PLACES ** (1 / n) + 1e-9)
