@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..models.scheduling_range import in_range_of_points
 from ..validation import one_of
 from .interpolator import Interpolator
 from .left_out import inner_levels, inner_places, interpolated_without
@@ -50,6 +52,9 @@ _SURE = 1e3
 # many at least, with less than this share of its squared errors, over the parameters.
 _CURVES = (("pchip", "linear"), ("cubic", "linear"), ("pchip", "log"), ("cubic", "log"))
 _SMOOTHER, _LEFT_OUT = 0.7, 3
+# Fewer variables, of so many at most, where errors are below this share without others.
+_WITHOUT, _FEW_VARIABLES = 0.3, 3
+_JOINT = 1e-3  # least singular value, in the range of the points, of ones on no line
 _FAR_LESS = 1e-3  # share of the errors below which a parameter says no more
 # Mean squared error, in the spread, of what must not be met worse; but for this share.
 _FORESEEN, _FEW = 0.02, 0.1
@@ -66,7 +71,9 @@ class AutoLPV(Interpolator):
     Where none is left, or the covariances are not known, the interpolation follows the
     points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
     the logarithms of the scheduling variables, meets points that are left out, three at
-    least, with clearly smaller errors (in the geometric mean over the parameters).
+    least, with clearly smaller errors (in the geometric mean over the parameters). Of
+    two or three scheduling variables forms and curves of fewer are tried where none of
+    all of them is proven: what depends on one foresees more with that one alone.
 
     Parameters
     ----------
@@ -144,42 +151,23 @@ class AutoLPV(Interpolator):
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         found: list[tuple[str, Any]] = []
-        for name, form in _forms(kappa) if points.whitening is not None else ():
-            form.fit(kappa, points.theta, points.root**2, points.covariance)
-            saturated = form.degrees_of_freedom_ <= 0  # it meets any points
-            if isinstance(form, PolynomialLPV) or not saturated:
-                found.append((name, form))
-        chi2 = np.array([form.chi2_ for _, form in found])
-        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
-        good = np.array([form.weighted_ for _, form in found], dtype=bool)
-        excess = 1.0
-        if not any(map(is_chance, chi2, dof)) and good.any():
-            excess = np.min(chi2[good] / dof[good])
-        n, chosen, proven = points.theta.size, 0, False
-        price = 2.0 if self.criterion == "aic" else math.log(n)
-        cost = chi2 / excess + price * (n - dof)
-        if good.any():
-            near = good & (cost <= cost[good].min() + _SUPPORT)
-            supported = np.flatnonzero(near).tolist()
-            # few points tell a parabola from a pole poorly: then it is the parabola
-            bent = [not _is_parabola(form) for _, form in found]
-            chosen = min(supported, key=lambda k: (bent[k], -dof[k], cost[k]))
-            free = bent[chosen] and n - dof[chosen] > _FREE * n
-            proven = not free
-            n_places = len(np.unique(kappa, axis=0))
-            if n - dof[chosen] >= n_places * points.theta.shape[1]:
-                # it meets any points; a common pole would not
-                poles = [
-                    k
-                    for k in supported
-                    if _has_shown_pole(found[k], found, kappa, points)
-                ]
-                if poles:
-                    chosen, proven = min(poles, key=lambda k: cost[k]), True
+        for fewer in (False, True):
+            for name, form in (
+                _forms(kappa, fewer) if points.whitening is not None else ()
+            ):
+                form.fit(kappa, points.theta, points.root**2, points.covariance)
+                saturated = form.degrees_of_freedom_ <= 0  # it meets any points
+                if isinstance(form, PolynomialLPV) or not saturated:
+                    found.append((name, form))
+            chosen, supported, proven, cost = self._best(found, kappa, points)
+            if proven:
+                break
         if not proven:
             name, curve = _interpolation(kappa, points)
-            if good.any():
+            if supported:
                 proven = _foresees(found[chosen][1], curve, kappa, points)
+        chi2 = np.array([form.chi2_ for _, form in found])
+        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
         if not proven:
             chosen = len(found)
             found.append((name, curve.fit(kappa, points.theta, points.root**2)))
@@ -194,6 +182,39 @@ class AutoLPV(Interpolator):
                 "chosen": np.arange(len(found)) == chosen,
             }
         )
+
+    def _best(
+        self, found: Sequence[tuple[str, Any]], kappa: Array, points: WeightedPoints
+    ) -> tuple[int, bool, bool, Array]:
+        """The form with most support, if any has; if that is proof; what all cost."""
+        chi2 = np.array([form.chi2_ for _, form in found])
+        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
+        good = np.array([form.weighted_ for _, form in found], dtype=bool)
+        excess = 1.0
+        if not any(map(is_chance, chi2, dof)) and good.any():
+            excess = np.min(chi2[good] / dof[good])
+        n = points.theta.size
+        price = 2.0 if self.criterion == "aic" else math.log(n)
+        cost = chi2 / excess + price * (n - dof)
+        if not good.any():
+            return 0, False, False, cost
+        near = good & (cost <= cost[good].min() + _SUPPORT)
+        supported = np.flatnonzero(near).tolist()
+        # few points tell a parabola from a pole poorly: then it is the parabola
+        bent = [not _is_parabola(form) for _, form in found]
+        chosen = min(supported, key=lambda k: (bent[k], -dof[k], cost[k]))
+        followed = _values_of(found[chosen][1].variables, kappa)
+        n_places = len(np.unique(followed, axis=0))
+        meets_any = n - dof[chosen] >= n_places * points.theta.shape[1]
+        if meets_any:  # a common pole would not
+            poles = [
+                k for k in supported if _has_shown_pole(found[k], found, kappa, points)
+            ]
+            if poles:
+                return min(poles, key=lambda k: cost[k]), True, True, cost
+        free = bent[chosen] and n - dof[chosen] > _FREE * n
+        surface = meets_any and np.count_nonzero(np.ptp(followed, axis=0)) > 1
+        return chosen, True, not (free or surface), cost
 
     def replaced(self, name: str, form: Interpolator) -> AutoLPV:
         """A copy that takes another form, on other evidence than the points'."""
@@ -250,10 +271,16 @@ def _has_shown_pole(
         return False
     if len(moving) < 2:  # of three values of one a line is found too easily
         return False
-    straight = next(f for name, f in found if name == f"polynomial {form.degree}")
+    straight = next(
+        other
+        for _, other in found
+        if isinstance(other, PolynomialLPV)
+        and (other.degree, other.variables) == (form.degree, form.variables)
+    )
     if not (straight.chi2_ > _SURE and noise_explains(form)):
         return False
-    P, inverse = points.covariance[:, moving[:, None], moving], RationalLPV(0, 1)
+    P = points.covariance[:, moving[:, None], moving]
+    inverse = RationalLPV(0, 1, variables=form.variables)
     return noise_explains(inverse.fit(kappa, points.theta[:, moving], None, P))
 
 
@@ -274,22 +301,47 @@ def _foresees(
     """Whether points left out are met as well as by a curve through the others.
 
     Better, of a form with a denominator: through few points it may be the cubic that a
-    spline is, and that tells nothing of what it is through all.
+    spline is, and that tells nothing of what it is through all. Where the others are
+    too few for it, whether no curve over fewer variables does.
     """
-    own, other = _errors_left_out([form, curve], kappa, points).sum(axis=(1, 2))
+    errors = _errors_left_out([form, curve], kappa, points, kappa)
+    if errors.shape[1] == 0:
+        return curve.variables is None or form.variables is not None
+    own, other = errors.sum(axis=(1, 2))
     return bool(own <= (_BETTER if getattr(form, "denominator", 0) else 1.0) * other)
 
 
 def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV]:
     """Name and kind of the curve through all points, not fitted."""
-    names, curves = [], []
-    for kind, scale in _CURVES:
-        if scale == "linear" or (kappa > 0.0).all():
-            names.append(kind if scale == "linear" else f"{scale} {kind}")
-            curves.append(SplineLPV(kind, scale=scale))
-    errors = _errors_left_out(curves, kappa, points)
+    best: list[tuple[str, SplineLPV]] = []
+    for variables, suffix in _choices_of_variables(kappa):
+        followed, curves = _values_of(variables, kappa), list(best)
+        for kind, scale in _CURVES:
+            if scale == "linear" or (followed > 0.0).all():
+                prefix = "" if scale == "linear" else f"{scale} "
+                curve = SplineLPV(kind, scale=scale, variables=variables)
+                curves.append((f"{prefix}{kind}{suffix}", curve))
+        # over fewer variables points are met by chance more easily
+        enough = _SMOOTHER if variables is None else _WITHOUT
+        best = [curves[_foreseeing(curves, followed, kappa, points, enough)]]
+    return best[0]
+
+
+def _foreseeing(
+    named: Sequence[tuple[str, SplineLPV]],
+    followed: Array,
+    kappa: Array,
+    points: WeightedPoints,
+    enough: float,
+) -> int:
+    """Which curve meets points left out with less than that share of the first's error.
+
+    The first, where none does, or too few points are within the range of the others.
+    """
+    curves = [curve for _, curve in named]
+    errors = _errors_left_out(curves, kappa, points, followed)
     if errors.shape[1] < _LEFT_OUT or not errors[0].any():
-        return names[0], curves[0]
+        return 0
     # of every parameter, relative to the first, and their geometric mean: noise of some
     # hides no law of others
     each = errors.sum(axis=1)
@@ -297,27 +349,29 @@ def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV
     shares = np.exp(np.mean(np.log(np.maximum(ratios, _FAR_LESS)), axis=1))
     seen = each[0] < _FORESEEN * errors.shape[1]
     worse = np.sum(each[:, seen] > _FORESEEN * errors.shape[1], axis=1)
-    allowed = worse <= _FEW * np.count_nonzero(seen)
-    best = int(np.argmin(np.where(allowed, shares, np.inf)))
-    if not shares[best] < _SMOOTHER:
-        best = 0
-    return names[best], curves[best]
+    shares[worse > _FEW * np.count_nonzero(seen)] = np.inf
+    for k, curve in enumerate(curves):  # logarithms that are nearly straight tell none
+        if curve.scale == "log" and k > 1 and shares[k] >= _SMOOTHER * shares[k - 2]:
+            shares[k] = np.inf
+    best = int(np.argmin(shares))
+    return best if shares[best] < enough else 0
 
 
 def _errors_left_out(
-    forms: Sequence[Any], kappa: Array, points: WeightedPoints
+    forms: Sequence[Any], kappa: Array, points: WeightedPoints, followed: Array
 ) -> Array:
     """Squared errors at points left out, (n_forms, n_left_out, n_moving).
 
-    Those within the range of the others, in the spread of every parameter that moves,
-    and by more than its noise where that is known. And on a grid all points of a level,
-    next to which others of the same level tell what only they do not.
+    Those within the range of the others, by what is `followed`, in the spread of every
+    parameter that moves, and by more than its noise where that is known. And on a grid
+    all points of a level, next to which others of the same level tell what only they do
+    not.
     """
     theta, spread = points.theta, np.ptp(points.theta, axis=0)
     covariance = points.covariance if points.whitening is not None else None
     moves = _moving(points)
     squares: list[Array] = []
-    for out in (*inner_places(kappa), *inner_levels(kappa)):
+    for out in (*inner_places(followed), *inner_levels(followed)):
         foreseen = [
             interpolated_without(out, form, kappa, theta, kappa[out], covariance)
             for form in forms
@@ -330,8 +384,42 @@ def _errors_left_out(
     return np.reshape(squares, shape).swapaxes(0, 1)
 
 
-def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
-    """Name and form of all whose numerators the points determine."""
+def _choices_of_variables(kappa: Array) -> Iterator[tuple[list[int] | None, str]]:
+    """All scheduling variables, and of two or three that vary fewer, with a suffix.
+
+    Of points that lie on a line nothing tells which one they follow.
+    """
+    yield None, ""
+    varies = np.flatnonzero(np.ptp(kappa, axis=0)).tolist()
+    x = in_range_of_points(kappa)[:, varies]
+    joint = np.linalg.matrix_rank(x - x.mean(axis=0), _JOINT) < len(varies)
+    if len(varies) <= _FEW_VARIABLES and not joint:
+        for n in range(len(varies) - 1, 0, -1):
+            for some in combinations(varies, n):
+                yield list(some), f" of variable {' and '.join(map(str, some))}"
+
+
+def _values_of(variables: Sequence[int] | None, kappa: Array) -> Array:
+    """The scheduling values that a form follows."""
+    return kappa if variables is None else kappa[:, variables]
+
+
+def _forms(
+    kappa: Array, fewer: bool
+) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
+    """Name and form of all whose numerators the points determine.
+
+    They follow all variables, or fewer; but for a constant, which follows none.
+    """
+    for variables, suffix in _choices_of_variables(kappa):
+        if fewer == (variables is not None):
+            for name, form in _forms_of_all(_values_of(variables, kappa)):
+                if not fewer or form.degree:
+                    yield f"{name}{suffix}", form.set_params(variables=variables)
+
+
+def _forms_of_all(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
+    """Those that follow all variables."""
     places = np.unique(kappa, axis=0)
     n, n_variables = len(places), max(int(np.count_nonzero(np.ptp(places, axis=0))), 1)
     for kind in ("total", "tensor")[:n_variables]:

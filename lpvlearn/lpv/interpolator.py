@@ -345,7 +345,26 @@ class Interpolator(
         # A point of weight zero counts as absent, for the range too.
         kappa = kappa[weight > 0]
         self.scheduling_range_ = np.array([kappa.min(axis=0), kappa.max(axis=0)])
+        held = ~self._follows()
+        kappa[:, held] = kappa[:1, held]
         return kappa, weighted_points(theta, weight, covariance)
+
+    def _follows(self) -> NDArray[np.bool_]:
+        """Which scheduling variables the form follows."""
+        n, variables = self.scheduling_range_.shape[1], getattr(self, "variables", None)
+        if variables is None:
+            return np.ones(n, dtype=bool)
+        places = np.asarray(variables)
+        if (
+            places.ndim != 1
+            or not np.issubdtype(places.dtype, np.integer)
+            or not np.isin(places, np.arange(n)).all()
+        ):
+            raise ValueError(
+                f"`variables` must be places of scheduling variables, from 0 to {n - 1}"
+                f", or None for all. Got {variables!r}."
+            )
+        return np.isin(np.arange(n), places)
 
     def _judge(
         self, points: WeightedPoints, values: Array, n_coefficients: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,8 @@ class PolynomialLPV(Interpolator):
         Basis of the published coefficients `coef_`; predictions do not depend on it.
         The orthogonal polynomials take each scheduling variable mapped linearly from
         `scheduling_range_` to [-1, 1]; powers take it as it is.
+    variables : sequence of int, default=None
+        Places of the scheduling variables that the parameters follow; None: all.
     extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
         What `predict` does outside of `scheduling_range_`: evaluate the polynomial
         without or with an `ExtrapolationWarning`, hold the value at the border, or
@@ -109,10 +112,12 @@ class PolynomialLPV(Interpolator):
         degree: int = 2,
         *,
         basis: str = "power",
+        variables: Sequence[int] | None = None,
         extrapolation: str = "ignore",
     ) -> None:
         self.degree = degree
         self.basis = basis
+        self.variables = variables
         self.extrapolation = extrapolation
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:

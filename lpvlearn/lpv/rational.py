@@ -8,7 +8,7 @@ numerators are a linear least-squares problem, so that a search has only d to fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +63,8 @@ class RationalLPV(Interpolator):
     terms : {"total", "tensor"}, default="total"
         With several scheduling variables: `degree` and `denominator` limit the sum of
         the powers in a product, or every one of them.
+    variables : sequence of int, default=None
+        Places of the scheduling variables that the parameters follow; None: all.
     extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
         What `predict` does outside of `scheduling_range_`: evaluate without or with an
         `ExtrapolationWarning`, hold the value at the border, or raise.
@@ -130,11 +132,13 @@ class RationalLPV(Interpolator):
         denominator: int = 2,
         *,
         terms: str = "total",
+        variables: Sequence[int] | None = None,
         extrapolation: str = "ignore",
     ) -> None:
         self.degree = degree
         self.denominator = denominator
         self.terms = terms
+        self.variables = variables
         self.extrapolation = extrapolation
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
@@ -150,23 +154,23 @@ class RationalLPV(Interpolator):
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
         limits = list(self._limits(kappa))
         limits = limits if psi.shape[1] else limits[:1]  # for no denominator
-        alike, plausible = points.unweighted(), None
+        alike, plausible, explained = points.unweighted(), None, False
         for limit in limits:
             found = fit_rational(phi, psi, limit, points)
             values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
             at = values, found.rank * q + psi.shape[1]
             self._judge(points, *at)
             exact = alike.misfit(values) <= _EXACT * values.size
-            if noise_explains(self) or points.whitening is None and exact:
-                break
+            explained = noise_explains(self) or points.whitening is None and exact
             if self.weighted_ and plausible is None:
                 plausible = found, at
-        else:
-            if plausible is None:
-                found = fit_rational(phi, psi, limits[0], alike)
-            else:
-                found, at = plausible
-                self._judge(points, *at)
+            if explained or not found.bound:
+                break
+        if plausible is not None and not explained:
+            found, at = plausible
+            self._judge(points, *at)
+        elif not explained:
+            found = fit_rational(phi, psi, limits[0], alike)
         self.numerator_, self.rank_ = found.numerator, found.rank
         self.denominator_ = np.concatenate([[1.0], found.denominator])
 
@@ -234,6 +238,7 @@ class Rational(NamedTuple):
     numerator: Array  # (n_terms, n_params)
     denominator: Array  # (n_denominator_terms - 1,), without the constant 1
     rank: int  # of the terms of a numerator
+    bound: bool  # whether the limit held the search back: else a wider one changes none
 
 
 class _Limit(NamedTuple):
@@ -262,9 +267,9 @@ def fit_rational(
     Terms of the numerators (n_points, n_terms), and of the denominator but for its
     constant (n_points, n_denominator_terms - 1), which keeps a limit.
     """
-    d = _Search(orth(phi), psi, limit, points).least()
+    d, bound = _Search(orth(phi), psi, limit, points).least()
     numerator, rank = points.coefficients(phi / (1.0 + psi @ d)[:, None])
-    return Rational(numerator, d, rank)
+    return Rational(numerator, d, rank, bound)
 
 
 class _State(NamedTuple):
@@ -282,13 +287,10 @@ class _Search(NamedTuple):
     limit: _Limit
     points: WeightedPoints
 
-    def starts(self) -> Iterator[Array]:
+    def starts(self) -> list[Array]:
         """Denominators: none, and the one of Sanathanan and Koerner."""
-        yield np.zeros(self.psi.shape[1])
-        if self.psi.shape[1]:
-            guess = self._sanathanan_koerner()
-            if self.limit.allows(guess):
-                yield guess
+        none = np.zeros(self.psi.shape[1])
+        return [none, self._sanathanan_koerner()] if none.size else [none]
 
     def _sanathanan_koerner(self) -> Array:
         """Minimise ``sum_i |(N^T phi_i - theta_i (1 + d^T psi_i)) / old_i|^2``."""
@@ -329,21 +331,34 @@ class _Search(NamedTuple):
         slopes = self._unexplained(basis, columns) if columns else none
         return _State(errors, slopes)
 
-    def least(self) -> Array:
-        """The denominator of the least misfit, without its constant."""
+    def least(self) -> tuple[Array, bool]:
+        """The denominator of the least misfit, and whether the limit refused others.
+
+        Without its constant.
+        """
+        none, bound = np.full(self.points.theta.size, np.inf), False
+        refused = _State(none, np.zeros((len(none), self.psi.shape[1])))
+
+        def state(d: Array) -> _State:
+            nonlocal bound
+            if self.limit.allows(d):
+                return self._at(d)
+            bound = True
+            return refused
 
         def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Any]:
-            none = np.full(self.points.theta.size, np.inf)
-            refused = _State(none, np.zeros((len(none), len(trial[0]))))
-            states = [self._at(d) if self.limit.allows(d) else refused for d in trial]
+            states = [state(d) for d in trial]
             errors = np.array([state.errors for state in states])
             return errors, lambda kept: np.array([states[k].slopes for k in kept])
 
-        starts = np.array(list(self.starts()))
         found = levenberg_marquardt(
-            residuals, starts, max_iter=_MAX_ITERATIONS, tol=_SAME, patience=1
+            residuals,
+            np.array(self.starts()),
+            max_iter=_MAX_ITERATIONS,
+            tol=_SAME,
+            patience=1,
         )
-        return found.x[np.argmin(found.cost)]
+        return found.x[np.argmin(found.cost)], bound
 
 
 def _places(scheduling_range: Array, kappa: Array, margin: float | Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,8 @@ class SplineLPV(Interpolator):
         What the curve is laid over: the scheduling variables, or their logarithms,
         where all are above zero: lengths, masses, speeds that range over a factor of
         two and more, of which powers are near to straight there.
+    variables : sequence of int, default=None
+        Places of the scheduling variables that the parameters follow; None: all.
     extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
         What `predict` does outside of `scheduling_range_`: go on (with one variable,
         along the tangent at the border) without or with an `ExtrapolationWarning`, hold
@@ -78,10 +81,12 @@ class SplineLPV(Interpolator):
         kind: str = "pchip",
         *,
         scale: str = "linear",
+        variables: Sequence[int] | None = None,
         extrapolation: str = "ignore",
     ) -> None:
         self.kind = kind
         self.scale = scale
+        self.variables = variables
         self.extrapolation = extrapolation
 
     def __getstate__(self) -> dict[str, Any]:
@@ -94,7 +99,7 @@ class SplineLPV(Interpolator):
             self._draw(self._theta)
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
-        if self.scale == "log" and not (kappa > 0.0).all():
+        if self.scale == "log" and not (kappa[:, self._follows()] > 0.0).all():
             raise ValueError(
                 "`scale` must be 'linear' where a scheduling variable is not above "
                 f"zero. Got 'log', and {kappa.min():.4g}."
@@ -131,16 +136,18 @@ class SplineLPV(Interpolator):
 
     def _varying(self, x: Array) -> Array:
         """The variables that take more than one value; one at least."""
-        varies = np.ptp(self.scheduling_range_, axis=0) > 0.0
+        varies = (np.ptp(self.scheduling_range_, axis=0) > 0.0) & self._follows()
         return x[:, varies] if varies.any() else x[:, :1]
 
     def _unit(self, kappa: Array) -> Array:
         """Where scheduling values lie from -1 to 1; beyond, along the tangent there."""
         if self.scale == "linear":
             return to_unit(kappa, self.scheduling_range_)
-        inside = np.clip(kappa, *self.scheduling_range_)
-        beyond = (kappa - inside) / inside
-        return to_unit(np.log(inside) + beyond, np.log(self.scheduling_range_))
+        follows = self._follows()  # the others may be below zero
+        scheduling_range = np.where(follows, self.scheduling_range_, 1.0)
+        inside = np.clip(kappa, *scheduling_range)
+        beyond = np.where(follows, kappa - inside, 0.0) / inside
+        return to_unit(np.log(inside) + beyond, np.log(scheduling_range))
 
     def _coefficients(self) -> Array:
         return self._theta.ravel()

@@ -14,9 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import clone
 
-from ..exceptions import collected
 from ..lpv.auto import AutoLPV
 from ..lpv.extrapolation import distance_from_hull
 from ..lpv.polynomial import PolynomialLPV
@@ -93,18 +91,16 @@ def is_better_form(
     kappa: Array,
     sizes: tuple[Array, Array],
     longest: float,
-    interpolator: AutoLPV,
+    auto: AutoLPV,
 ) -> bool:
     """Whether a form carries canonical parameters, and foresees points no worse.
 
     Points that are left out, no worse than what is interpolated of `aligned` models
     (not much worse, where outputs integrate), inputs and outputs in units of their
     `sizes`, what does not decay in the `longest` record (seconds) forgotten. Judged by
-    what the `interpolator` chooses: a low form, or any where outputs integrate.
+    what `auto`, fitted to them, chose: a low form, or any where outputs integrate.
     """
     structure, theta, covariance = canonical
-    with collected():
-        auto = clone(interpolator).fit(kappa, theta, covariance=covariance)
     form = auto.best_estimator_
     # aligned states let the rate jump with kappa, and an integrator keeps that
     if not (_is_low(form) or local[0].integrating):

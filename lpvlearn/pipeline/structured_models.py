@@ -72,6 +72,7 @@ class StructuredModels(NamedTuple):
     covariance: Array  # (n_points, n_params, n_params): NaN where not known
     models: list[StateSpace]
     restructurers: list[Any]  # fitted; empty without that step
+    interpolator: AutoLPV | None = None  # which is fitted to them already
 
 
 def restructure_points(
@@ -253,17 +254,19 @@ def without_structure(
     found = canonical_black_boxes(local)
     if found is None:
         return [aligned]
+    kappa = points.kappa
+    auto = clone(interpolator).fit(kappa, found.theta, covariance=found.covariance)
     better = is_better_form(
         found,
         (aligned.structure, aligned.theta),
         local,
-        points.kappa,
+        kappa,
         channel_sizes(points.experiments),
         sampling_time * points.n_longest,
-        interpolator,
+        auto,
     )
     models = _delayed(found.structure, found.theta, local)
-    canonical = StructuredModels(points, local, *found, models, [])
+    canonical = StructuredModels(points, local, *found, models, [], auto)
     ways = [canonical, aligned] if better else [aligned, canonical]
     return ways if every else ways[:1]
 
@@ -280,6 +283,9 @@ def _delayed(
 
 def over_points(interpolator: Any, found: StructuredModels) -> Any:
     """The interpolator, fitted to parameters, and by their covariances if it may."""
+    known: Any = found.interpolator
+    if known is not None and known.get_params() == interpolator.get_params():
+        return known
     known = {}
     if takes_covariance(interpolator):
         known["covariance"] = found.covariance

@@ -300,3 +300,35 @@ def test_entries_that_are_noise_hide_no_law_of_one(seed):
     between = np.sqrt(level[1:] * level[:-1])
     pole = model.predict(between)[:, :1]
     np.testing.assert_allclose(pole, -0.05 / np.sqrt(between), rtol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_variable_that_tells_nothing_is_left_out(seed):
+    """A supply voltage, say, that is nearly constant; six points tell of no plane."""
+    rng = np.random.default_rng(seed)
+    speed, supply = np.linspace(0, 2, 6), 5.0 + 0.03 * rng.standard_normal(6)
+    kappa = np.column_stack([speed, supply])
+
+    def truth(x):
+        return np.column_stack([40 + 20 * x**2, np.exp(x), 30 / (1 + x)])
+
+    theta = truth(speed) + 1e-3 * rng.standard_normal((6, 3))
+    known = {"covariance": np.tile(1e-6 * np.eye(3), (6, 1, 1))}
+    between = 0.5 * (kappa[1:] + kappa[:-1])
+    model, alone = AutoLPV().fit(kappa, theta, **known), AutoLPV()
+    alone.fit(kappa[:, :1], theta, **known)
+    assert model.form_ == f"{alone.form_} of variable 0"
+    assert model.best_estimator_.variables == [0]
+    np.testing.assert_allclose(model.predict(between), alone.predict(between[:, :1]))
+    refitted = model.best_estimator_.fit(kappa, theta)
+    np.testing.assert_array_equal(
+        refitted.predict(between), refitted.predict(between * [1.0, 1.001])
+    )
+
+
+def test_variables_that_matter_are_kept():
+    grid = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]), -1).reshape(-1, 2)
+    theta = grid[:, 0] ** 2 + 0.1 * grid[:, 1]
+    model = AutoLPV().fit(grid, theta, covariance=np.full(9, 1e-6))
+    assert model.best_estimator_.variables is None
+    assert not model.selection_["form"].str.contains("of variable").any()

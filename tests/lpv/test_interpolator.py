@@ -234,3 +234,26 @@ def test_information_is_inflated_where_the_form_is_not_true():
         exact.information(KAPPA, P), S.T @ S / 1e-6, rtol=1e-6, atol=1e-3
     )
     assert exact.information(KAPPA, np.nan * P) is None
+
+
+@pytest.mark.parametrize("form", [PolynomialLPV(2), RationalLPV(1, 1), SplineLPV()])
+def test_a_form_may_follow_some_of_the_variables(form):
+    rng = np.random.default_rng(0)
+    kappa = np.column_stack([np.linspace(1, 2, 6), rng.uniform(-1, 1, 6)])
+    theta = 1.0 / kappa[:, 0]
+    some = clone(form).set_params(variables=[0]).fit(kappa, theta)
+    alone = clone(form).fit(kappa[:, :1], theta)
+    between = 0.5 * (kappa[1:] + kappa[:-1])
+    np.testing.assert_allclose(some.predict(between), alone.predict(between[:, :1]))
+    np.testing.assert_array_equal(some.scheduling_range_, [kappa.min(0), kappa.max(0)])
+    assert some.coefficients().shape == alone.coefficients().shape
+    for wrong in ([2], [0.5], ["k"], 0, []):
+        with pytest.raises(ValueError, match="`variables` must be places of schedul"):
+            clone(form).set_params(variables=wrong).fit(kappa, theta)
+
+
+def test_logarithms_are_taken_of_the_variables_that_are_followed():
+    kappa = np.column_stack([np.geomspace(1, 100, 6), np.linspace(-1, 1, 6) ** 3])
+    theta = np.log(kappa[:, 0])
+    curve = SplineLPV("cubic", scale="log", variables=[0]).fit(kappa, theta)
+    np.testing.assert_allclose(curve.predict([[10.0, -5.0]]), np.log(10.0))

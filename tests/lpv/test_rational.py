@@ -192,3 +192,20 @@ def test_no_pole_is_near_between_points(seed):
         below = model._terms(fine, model.denominator_powers_) @ model.denominator_
         at_end = below[[0, -1]].min() == below.min()
         assert below.min() >= (0.002 if at_end else 0.02) * below.max()
+
+
+@pytest.mark.parametrize("ratio", [60.0, 1e3, 1e5])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_pole_may_lie_at_zero_however_near_that_is(ratio, sign):
+    """What is divided by a mass, of any range; but not where the sign changes."""
+    mass = sign * np.geomspace(1.0, ratio, 6)[:, None]
+    theta = np.hstack([20.0 / mass, 3.0 + 0.0 * mass])
+    model = RationalLPV(1, 1).fit(mass, theta)
+    between = sign * np.sqrt(mass[1:] * mass[:-1])
+    np.testing.assert_allclose(model.predict(between)[:, 0], 20.0 / between[:, 0])
+    across = mass - 2.0 * sign  # from below zero to above
+    other = RationalLPV(1, 1).fit(across, 1.0 / (across + 1.001 * sign))
+    low, high = np.sort(across[[0, -1], 0])
+    wide = np.linspace(low - 0.02 * (high - low), high + 0.02 * (high - low), 4000)
+    terms = other._terms(wide[:, None], other.denominator_powers_)
+    assert (terms @ other.denominator_ > 0.0).all()
