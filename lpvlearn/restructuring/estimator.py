@@ -85,6 +85,9 @@ _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
+# Of the H-infinity norm's own, and of the black box: an error that is larger by both is
+# none that weighing by the uncertainty of the black box should lead to.
+_ASTRAY, _FAR = 10.0, 0.1
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has
@@ -820,6 +823,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 others=others,
                 sampling_time=dt,
                 admissible=admissible,
+                astray=lambda theta: (
+                    problem.system.peaks(theta).norm
+                    > max(_ASTRAY * self.hinf_error_, _FAR * size)
+                ),
             )
         else:
             box = measured_response(problem.omega, problem.response, problem.noise)

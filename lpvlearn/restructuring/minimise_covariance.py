@@ -28,7 +28,7 @@ n_params degrees of freedom.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -235,6 +235,7 @@ def efficient_parameters(
     others: Sequence[Array] = (),
     sampling_time: float | None = None,
     admissible: Callable[[Array], bool] | None = None,
+    astray: Callable[[Array], bool] | None = None,
 ) -> CovarianceFit | None:
     """Parameters of a structure from independent estimates of one system.
 
@@ -242,8 +243,9 @@ def efficient_parameters(
     for `UncertainBoxes`. None where an uncertainty is not known, or the start does not
     keep the stability margin. If the noise does not explain what is found, the search
     begins at `others` as well: in other units of the outputs another basin is the
-    lowest. Of models with known poles a margin says nothing: what is `admissible` is
-    given.
+    lowest. Where all that is found is `astray`, so far from the black box that the
+    uncertainty can be none of its, the start stays. Of models with known poles a margin
+    says nothing: what is `admissible` is given.
     """
     known = UncertainBoxes.of(structure, estimates, sampling_time)
     if known is None:
@@ -251,14 +253,20 @@ def efficient_parameters(
     system, boxes = known.system, known.boxes
     margin = natural_margin(system.target)
 
-    def search(start: Array) -> CovarianceFit | None:
-        return minimise_covariance(system, start, margin, boxes, admissible=admissible)
+    def search(start: Array, max_iter: int = _MAX_ITER) -> CovarianceFit | None:
+        return minimise_covariance(
+            system, start, margin, boxes, admissible=admissible, max_iter=max_iter
+        )
 
     best = search(start)
     if best is None or best.is_plausible:
         return best
     found = [best, *map(search, others)]
-    return min((fit for fit in found if fit is not None), key=lambda fit: fit.cost)
+    best = min((fit for fit in found if fit is not None), key=lambda fit: fit.cost)
+    if astray is None or best.is_plausible or not astray(best.theta):
+        return best
+    stays = search(start, 0)
+    return None if stays is None else replace(stays, converged=True)  # it is no search
 
 
 def minimise_covariance(
@@ -268,6 +276,7 @@ def minimise_covariance(
     boxes: Sequence[UncertainResponse],
     *,
     admissible: Callable[[Array], bool] | None = None,
+    max_iter: int = _MAX_ITER,
 ) -> CovarianceFit | None:
     """Parameters nearest to black boxes in the metric of their own uncertainty.
 
@@ -315,7 +324,7 @@ def minimise_covariance(
         np.asarray(start, dtype=float)[None],
         lower=lower,
         upper=upper,
-        max_iter=_MAX_ITER,
+        max_iter=max_iter,
         tol=_DECREASE,
         stop=time_is_up,
     )

@@ -83,6 +83,7 @@ def test_a_level_is_not_taken_for_motion(time_constant):
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 @pytest.mark.filterwarnings("ignore:The simulation error depends on past inputs")
+@pytest.mark.filterwarnings("ignore:The model explains next to nothing")
 def test_rest_is_not_taken_for_motion(order, pole):
     """Models of too low an order and the right one, at 10 dB; warnings are errors."""
     for seed in range(5):
