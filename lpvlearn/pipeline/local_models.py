@@ -18,7 +18,7 @@ from sklearn.base import clone
 from ..data.experiments import ROLES, Experiment, as_table
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
-from ..exceptions import collected, retold, warn
+from ..exceptions import Told, collected, retold, warn
 from ..lpv.alignment import rotation_to
 from ..models.statespace import (
     ModelPair,
@@ -29,6 +29,7 @@ from ..models.statespace import (
 from ..restructuring.known_poles import hidden_integrators, integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
+from ..subspace.constants import CERTAIN
 from ..subspace.criterion import PRICE
 from ..subspace.delay import with_late_inputs
 from ..subspace.estimator import SubspaceLTI
@@ -63,6 +64,10 @@ _PROBED, _CLEARER = 5, 6.0
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first: a mode may vanish, or come.
 _SCOUTS, _FEWER, _MORE = 3, 2, 2
+
+# States that a disturbance may have beside those of a structure: two resonances, or a
+# resonance and two drifts.
+_OF_LOADS = 4
 
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
@@ -458,7 +463,7 @@ def identify_point(
     an unstable model, which cannot be balanced. `efficient` gives `estimates`,
     `deviate` the `pairs` of a pooled one, which these need. The order may be the `most`
     that there can be: a pooled model then leaves out states that the samples do not ask
-    for, where they alternate.
+    for, where they alternate. In a loop those of a disturbance come to it.
     """
     if _integrates(local) and combine == "average":
         raise ValueError(
@@ -469,7 +474,8 @@ def identify_point(
     labels = _labels_of(experiments)
     if combine == "average" and len(labels) > 1:
         runs = [[e for e in experiments if e.label == label] for label in labels]
-        each = zip(labels, _fit_alike(local, runs, sampling_time), strict=True)
+        alike = _fit_alike_at_most if most else _fit_alike
+        each = zip(labels, alike(local, runs, sampling_time), strict=True)
         return _averaged(dict(each), experiments, discretization, advice, efficient)
     fit = _fit_at_most if most else _fit_local
     pooled = fit(local, experiments, sampling_time)
@@ -769,17 +775,22 @@ def _fit_local(
 def _fit_at_most(
     local: Any, experiments: Sequence[Experiment], sampling_time: float
 ) -> Any:
-    """The same with fewer states where some of them alternate, and are not asked for.
+    """The same with more states in a loop, where these are those of a disturbance.
 
-    No system in continuous time has a pole on the negative real axis: a state more than
-    the samples show follows their noise there.
+    And with fewer ones where some of them alternate, and are not asked for: no system
+    in continuous time has a pole on the negative real axis, and a state more than the
+    samples show follows their noise there.
     """
     with retold() as told:
         fitted = _fit_local(local, experiments, sampling_time)
+        if _from_closed_loop(fitted):
+            likelier = _fit_with_loads(local, fitted, experiments, sampling_time)
+            if likelier is not None:
+                fitted, told[:] = likelier
         n_alternating = len(_alternating(fitted.lti_))
         if not n_alternating:
             return fitted
-        highest = local.get_params()["order"]
+        highest = fitted.order_ - len(_integrating(fitted))
         fewer = range(max(1, highest - n_alternating), highest + 1)
         with collected() as other, suppress(ValueError):
             again = clone(local).set_params(order=fewer)
@@ -788,6 +799,50 @@ def _fit_at_most(
                 told[:] = other
                 return again
         return fitted
+
+
+def _fit_alike_at_most(
+    local: Any, realisations: Sequence[Sequence[Experiment]], sampling_time: float
+) -> list[Any]:
+    """As `_fit_alike`, with the states of a disturbance that the first one shows."""
+    with retold() as told:
+        fitted = _fit_alike(local, realisations, sampling_time)
+        if not _from_closed_loop(fitted[0]):
+            return fitted
+        # one tells of all: beyond chance
+        likelier = _fit_with_loads(
+            local, fitted[0], realisations[0], sampling_time, asked=CERTAIN
+        )
+        if likelier is None:
+            return fitted
+        told.clear()
+        order = likelier[0].order_ - len(_integrating(likelier[0]))
+        more = clone(local).set_params(order=order)
+        return _fit_alike(more, realisations, sampling_time)
+
+
+def _fit_with_loads(
+    local: Any,
+    fitted: Any,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+    asked: float = 0.0,
+) -> tuple[Any, list[Told]] | None:
+    """A likelier model of more states than the fitted one, and what is told of it.
+
+    In a loop plant and noise share their states, and what inputs know of a disturbance
+    is one more: with as many as the plant has alone, the likeliest ones are those of
+    the disturbance as well. None where more are not worth what they cost, or not by
+    as much as is `asked`.
+    """
+    order = local.get_params(deep=False)["order"]
+    more = clone(local).set_params(order=range(order, order + _OF_LOADS + 1))
+    with collected() as told, suppress(ValueError):
+        other = _fit_local(more, experiments, sampling_time)
+        known, its = (_criterion(getattr(f, "rates_", f)) for f in (fitted, other))
+        if other.order_ > fitted.order_ and its < known - asked:
+            return other, told
+    return None
 
 
 def _alternating(model: StateSpace) -> Array:

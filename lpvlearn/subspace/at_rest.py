@@ -123,13 +123,15 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
 
     Where these leave the static gain unknown, or stand for a constant, they must be
     likelier beyond chance: it is they that take the gain. Rest elsewhere, at inputs of
-    zero, has as many unknowns.
+    zero, has as many unknowns. A mode that hardly decays may follow a drift, but for
+    that of a likelier model where outputs were seen to stand.
     """
     worse = own.one_step.criterion - other.one_step.criterion
     by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
     decays = n_decays(own.model.A, own.longest)
     settles = decays > (HARDLY_DECAYS if drifts_off else 1.0)
-    if not (len(own.model.A) and settles):
+    stood = seen and worse <= 0.0 < decays
+    if not (len(own.model.A) and (settles or stood)):
         return False
     left, plainly = _plain_errors(own, other)
     if not other.free.initial_states:

@@ -59,6 +59,71 @@ def test_a_plant_in_a_loop_keeps_what_its_own_method_found(combine):
         assert 0.01 < std < 0.5 and abs(error) < 3.0 * std
 
 
+def two_lags_in_a_loop(seed, load, sensor=0.02, n_samples=1200):
+    """Two lags under PI control, with a coloured load on their input; and the plant."""
+    rng, step = np.random.default_rng(seed), 0.2
+    truth = StateSpace([[-1.45, 0.5], [0.0, -0.8]], [[0], [10.0]], [[1, 0]], [[0]])
+    A, B, C = (getattr(truth.to_discrete(step), name) for name in "ABC")
+    reference = 3.0 * rng.uniform(-1, 1, n_samples // 60 + 1).repeat(60)
+    u, y = np.zeros((2, n_samples, 1))
+    x, integral, d = np.zeros(2), 0.0, 0.0
+    for t in range(n_samples):
+        y[t] = C @ x + sensor * rng.standard_normal()
+        error = reference[t] - y[t, 0]
+        integral += 0.04 * error * step
+        u[t] = 0.05 * error + integral
+        d = 0.95 * d + 0.1 * load * rng.standard_normal()
+        x = A @ x + B[:, 0] * (u[t, 0] + d)
+    return Experiment(seed, np.arange(n_samples), u, y), truth
+
+
+def error_at_order_two(records, truth, **options):
+    """Relative, of the response of the local model, which may have more states."""
+    options = {"combine": "pool", "discretization": "zoh"} | options
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        point = identify_point(SubspaceLTI(2), records, sampling_time=0.2, **options)
+    w = np.logspace(-1.5, 0.7, 60)
+    G, H = (np.ravel(m.frequency_response(w)) for m in (point.lti, truth))
+    return point.order, np.linalg.norm(G - H) / np.linalg.norm(H)
+
+
+@pytest.mark.parametrize(
+    "seeds", [(13,), pytest.param((11, 12, 13), marks=pytest.mark.slow)]
+)
+def test_a_load_has_states_of_its_own_beside_those_of_a_structure(seeds):
+    errors = []
+    for seed in seeds:
+        record, truth = two_lags_in_a_loop(seed, load=0.3)
+        order, error = error_at_order_two([record], truth, most=True)
+        assert order > 2
+        errors.append((error, error_at_order_two([record], truth)[1]))
+    with_load, without = np.mean(errors, axis=0)
+    assert with_load < min(0.1, 0.5 * without)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("combine", ["pool", "average"])
+def test_white_noise_in_a_loop_adds_no_states(combine):
+    pairs = [two_lags_in_a_loop(seed, load=0.0, sensor=0.1) for seed in (5, 6)]
+    records, truth = [record for record, _ in pairs], pairs[0][1]
+    found = [
+        error_at_order_two(records, truth, combine=combine, most=most)
+        for most in (False, True)
+    ]
+    assert found[0] == found[1] and found[0][0] == 2
+
+
+@pytest.mark.slow
+def test_realisations_in_a_loop_have_the_states_of_their_load():
+    pairs = [two_lags_in_a_loop(seed, load=0.3) for seed in (11, 12, 13)]
+    records, truth = [record for record, _ in pairs], pairs[0][1]
+    options = {"combine": "average"}
+    order, error = error_at_order_two(records, truth, most=True, **options)
+    assert order > 2
+    assert error < 0.6 * error_at_order_two(records, truth, **options)[1]
+
+
 def test_a_state_that_alternates_with_the_noise_is_left_out():
     # the fast one of four lags hardly shows: a fourth state follows the noise
     rates = np.array([0.5, 0.7, 1.0, 6.0])

@@ -302,3 +302,46 @@ def test_a_step_after_one_sample_is_no_impact(seed):
         warnings.simplefilter("ignore", UserWarning)
         model = SubspaceLTI(1, sampling_time=1.0).fit(u, y)
     assert abs(model.lti_.dc_gain() / plant.dc_gain() - 1.0) < 0.02
+
+
+def doublet(seed, n, lead, step=0.02):
+    """A pitch doublet (3-2-1-1) of a plane, whose phugoid takes longer than that."""
+    rng = np.random.default_rng(seed)
+    plane = StateSpace(
+        [[-0.02, 0.04, 0, -9.81], [-0.06, -0.9, 60, 0], [0.001, -0.08, -1.2, 0]]
+        + [[0, 0, 1, 0]],
+        [[0], [-8], [-6], [0]],
+        [[0, 1 / 60, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    ).to_discrete(step)
+    stick = np.repeat([0, 1, -1, 1, -1, 0], [lead, 150, 100, 50, 50, n - lead - 350])
+    u = stick[:, None].astype(float)
+    y = plane.simulate(u)
+    return plane, u, y + 0.03 * y.std(axis=0) * rng.standard_normal(y.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "n", "lead"), [(7, 800, 200), (9, 700, 150), (7, 1500, 50)]
+)
+def test_a_mode_longer_than_the_record_begins_at_rest_and_is_no_drift(seed, n, lead):
+    plane, u, y = doublet(seed, n, lead)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        model = SubspaceLTI(sampling_time=0.02).fit(u, y)
+    assert model.order_ == 4 and model.offset_ is None
+    assert not model.initial_states_.any()
+    rng = np.random.default_rng(0)
+    other = rng.choice([-1.0, 1.0], (30, 1)).repeat(50, axis=0)
+    truth = plane.simulate(other)
+    error = np.linalg.norm(model.predict(other) - truth, axis=0)
+    assert (error < 0.15 * np.linalg.norm(truth - truth.mean(axis=0), axis=0)).all()
+
+
+def test_a_slow_mode_in_motion_is_not_taken_for_rest():
+    rng = np.random.default_rng(1)
+    before = 5.0 * rng.standard_normal(300)
+    u = np.r_[np.zeros(60), rng.choice([-1.0, 1.0], 26).repeat(25)]
+    y = lfilter([0.0, 0.1], np.poly([0.9, 0.9995]), np.r_[before, u])[300:]
+    y += 0.03 * y.std() * rng.standard_normal(len(y))
+    model = SubspaceLTI(2, offset=None).fit(u[:, None], y)
+    assert model.initial_states_.any()
