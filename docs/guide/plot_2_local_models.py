@@ -345,9 +345,10 @@ local.residual_tests(X, y)
 # A linear model of a plant that bends (friction, a valve, a sensor that saturates) is
 # an average over the motions of its record, and simulates others worse, however small
 # its standard deviations are. In open loop a fit warns where squares and cubes of the
-# inputs, or of what they do, explain errors of more than 3 % of an output, or else what
-# these lose in play, as in gears and by friction: the errors of a linear plant do not
-# know these. Here the input acts by its hyperbolic tangent:
+# inputs, or of what they do, explain errors of more than 3 % of an output, or what
+# these lose in play, as in gears and by friction, or large changes of the inputs, as
+# behind an actuator whose rate is limited: the errors of a linear plant do not know
+# these. Here the input acts by its hyperbolic tangent:
 
 bending = np.random.default_rng(0).uniform(-2.0, 2.0, (100, 1)).repeat(5, axis=0)
 answer = np.zeros(len(bending))

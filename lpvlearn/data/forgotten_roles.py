@@ -50,14 +50,17 @@ def warn_of_forgotten_roles(
     """
     for k, name in enumerate(names):
         column = inputs[:, k]
-        if roles["time"] is None and _is_clock(column, groups):
+        # Times of one experiment after another begin at zero. What falls back beside no
+        # input, or from above zero to below, is a sawtooth that the system got.
+        anew = inputs.shape[1] > 1 and bool(column.min(initial=0.0) >= 0.0)
+        if roles["time"] is None and _is_clock(column, groups, anew):
             warn(
                 f"Input column {name!r} rises by the same {_typical_step(column):.6g} "
                 "from row to row, as times and row numbers do. If it is the time, name "
                 f"it: time={name!r}; if it numbers the rows, drop it; if it is a ramp "
                 "that the system got, list the inputs in `inputs`."
             )
-        elif roles["time"] is None and _is_clock(-column, groups):
+        elif roles["time"] is None and _is_clock(-column, groups, anew):
             warn(
                 f"Input column {name!r} falls by the same {-_typical_step(column):.6g} "
                 "from row to row, as times do where the latest row comes first. If it "
@@ -151,10 +154,11 @@ def _typical_step(column: Array) -> float:
     return float(np.median(np.diff(column)))
 
 
-def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
+def _is_clock(column: Array, groups: Sequence[Indices], anew: bool) -> bool:
     """Whether a column rises evenly, from anew where another experiment begins.
 
-    Evenly but for the jitter of stamps, and for those of rows that are missing.
+    Where nobody named the experiments, it may begin `anew` within what is taken for
+    one. Evenly but for the jitter of stamps, and for those of rows that are missing.
     """
     parts = [column[rows] for rows in groups]
     steps = np.concatenate([np.diff(part) for part in parts])
@@ -163,7 +167,8 @@ def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
     typical = float(np.median(steps))
     n_back, n_over = int((steps < 0).sum()), int(missing_after(steps, typical).sum())
     few = _RESTARTS * len(steps)
-    if not typical > 0 or n_over > few or n_back > (few if len(groups) == 1 else 0):
+    n_anew = few if anew and len(groups) == 1 else 0
+    if not typical > 0 or n_over > few or n_back > n_anew:
         return False
     uneven = steps[np.abs(steps - typical) > _EVEN * typical]
     if (uneven < 0).all():

@@ -43,6 +43,15 @@ _FEW_STEPS, _STEP, _STILL = 3, 0.05, 10
 _SPIKE, _ABOUT, _MOST = 4.0, 7, 0.95
 _NAMED = 3  # experiments that a message lists
 
+# White noise of a sensor widens no spread: means over windows are free of it, as long
+# as they take away no more than white noise of the variance that third differences
+# have (squares of their binomial coefficients add up to 20), but for chance: three
+# standard deviations of such a variance, 2.15 / sqrt(n). Third differences of what
+# moves are far smaller than what means take away of it, unless it turns every sample.
+_DIFFERENCES, _OF_DIFFERENCES, _BY_CHANCE = 3, 20.0, 6.5
+_HIDDEN = 4  # windows of a record in which a motion may hide behind noise
+_WINDOWS = tuple(2**k + 1 for k in range(1, 24))  # samples, odd: about one of them
+
 _ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
 _CLOSE = 0.01  # share of the range within which means are one point, if not more
 _MANY_VARIABLES = 4  # beyond, a triangulation has too many edges: the nearest points do
@@ -168,18 +177,19 @@ def _without_spikes(
 def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
     """Refuse experiments within which a scheduling variable moves too far.
 
-    Its spread (maximum minus minimum) is compared with its range over the operating
-    points `kappa`. Where that is zero: with its largest magnitude, and only if the
-    variable travels; noise and oscillations about one point have no scale to compare
-    with. One that stands still but for a few steps is at several points.
+    Its spread (maximum minus minimum, white noise aside) is compared with its range
+    over the operating points `kappa`. Where that is zero: with its largest magnitude,
+    and only if the variable travels; noise and oscillations about one point have no
+    scale to compare with. One that stands still but for a few steps is at several
+    points.
     """
     extent = np.ptp(kappa, axis=0)
     for run in experiments:
         if run.scheduling is None or run.scheduling.shape[1] == 0:
             continue
-        spread = np.ptp(run.scheduling, axis=0)
+        spread, reach = _spread(run.scheduling, _HIDDEN), np.ptp(run.scheduling, axis=0)
         scale = np.where(extent > 0, extent, np.abs(run.scheduling).max(axis=0))
-        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * spread)
+        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * reach)
         excess = np.where(travels, spread - _MAX_SPREAD * scale, 0.0)
         worst = int(np.argmax(excess))
         if excess[worst] > 0:
@@ -190,6 +200,11 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 if len(experiments) == 1
                 else ""
             )
+            if _says_nothing(experiments, extent)[worst]:
+                several = (
+                    f" Variable {worst + 1} hardly differs between the points, compared"
+                    " with how it moves within them: leave it out of `scheduling`."
+                )
             raise ValueError(
                 f"Experiment {run.label!r} must be local. Got a scheduling variable "
                 f"{worst + 1} that spreads over {spread[worst]:.4g}, more than "
@@ -201,7 +216,7 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
             )
         changes = np.count_nonzero(np.diff(run.scheduling, axis=0), axis=0)
         steps = (changes > 0) & (changes <= min(_FEW_STEPS, len(run.rows) // _STILL))
-        steps &= (extent > 0) & (spread > _STEP * extent)
+        steps &= (extent > 0) & (reach > _STEP * extent)
         if steps.any():
             k = int(steps.argmax())
             first, last = run.scheduling[[0, -1], k]
@@ -211,6 +226,19 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 f"{last:.4g} within it: name the column that tells experiments apart "
                 "by `experiment`, or cut the record by `split_levels`."
             )
+
+
+def _says_nothing(
+    experiments: Sequence[Experiment], extent: Array
+) -> NDArray[np.bool_]:
+    """Variables that tell no points apart, where another one does.
+
+    Within most experiments they move too far, for the `extent` of the points.
+    """
+    signals = [run.scheduling for run in experiments if run.scheduling is not None]
+    usual = np.median([_spread(signal, _HIDDEN) for signal in signals], axis=0)
+    silent = usual > _MAX_SPREAD * extent
+    return silent & ((extent > 0) & ~silent).any()
 
 
 def moving_experiments(
@@ -225,13 +253,14 @@ def moving_experiments(
     if any(run.scheduling is None for run in experiments):
         return list(experiments), []
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
-    spread = np.array([np.ptp(signal, axis=0) for signal in signals])
+    spread = np.array([_spread(signal, _HIDDEN) for signal in signals])
+    reach = np.array([np.ptp(signal, axis=0) for signal in signals])
     between = np.ptp([signal.mean(axis=0) for signal in signals], axis=0)
     travel = np.array([_travel(signal) for signal in signals])
     low, high = _extremes(signals)
     far = spread > _MAX_SPREAD * (high - low)
     apart = between > spread.min(axis=0)
-    moves = (far & (apart | (travel > _SWEEP * spread))).any(axis=1)
+    moves = (far & (apart | (travel > _SWEEP * reach))).any(axis=1)
     local = [run for run, away in zip(experiments, moves, strict=True) if not away]
     return local, [run for run, away in zip(experiments, moves, strict=True) if away]
 
@@ -248,6 +277,36 @@ def _motion(experiments: Sequence[Experiment]) -> Array:
     if not signals:
         return np.zeros(1)
     return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _spread(scheduling: Array, n_windows: int = _PARTS) -> Array:
+    """Maximum minus minimum of each column, of its means where these lose noise only.
+
+    So many windows make up the record, at least: with many of them means of experiments
+    at one point differ by less, with few of them the motion is known best. A straight
+    line has the spread that it had: its means reach less far, by their window.
+    """
+    spread, n = np.ptp(scheduling, axis=0), len(scheduling)
+    if n < n_windows * _WINDOWS[0] or not spread.any():
+        return spread
+    centred = scheduling - scheduling.mean(axis=0)
+    sums = np.cumsum(np.vstack([np.zeros_like(centred[:1]), centred]), axis=0)
+    differences = np.diff(centred, _DIFFERENCES, axis=0)
+    noise = (differences**2).mean(axis=0) / _OF_DIFFERENCES
+    only_noise = noise > (_ROUNDING * spread) ** 2
+    for window in _WINDOWS:
+        if window > n // n_windows:
+            break
+        means = (sums[window:] - sums[:-window]) / window
+        lost = centred[window // 2 :][: len(means)] - means
+        most = (1.0 + _BY_CHANCE / np.sqrt(n)) * (1.0 - 1.0 / window) * noise
+        only_noise &= (lost**2).mean(axis=0) <= most
+        if not only_noise.any():
+            break
+        narrower = np.minimum(spread, np.ptp(means, axis=0) * n / len(means))
+        spread = np.where(only_noise, narrower, spread)
+    return spread
 
 
 def _travel(scheduling: Array) -> Array:
@@ -274,9 +333,9 @@ def group_operating_points(
     Experiments with an operating-point label are grouped by it; the others by the mean
     of their scheduling variable: means of one point are within `tol` of a neighbour, by
     default the larger of 1 % of their range and the spread of the variable within one
-    of the two, or the median spread where that is less. Values that stand still within
-    both experiments are within 1 % of their size as well: 1, 10, 100, 1000 are four
-    points. A ValueError where they form a longer chain.
+    of the two, white noise aside, or the median spread where that is less. Values that
+    stand still within both experiments are within 1 % of their size as well: 1, 10,
+    100, 1000 are four points. A ValueError where they form a longer chain.
 
     The values (n_points, n_scheduling) are the means over a point's experiments, in
     lexicographic order; without scheduling columns `n_scheduling` is 0, and points are
@@ -310,7 +369,7 @@ def _tolerance(
 ) -> tuple[Array, Array]:
     """Of every pair of experiments (n, n, n_scheduling), and the largest."""
     if tol is None:
-        spreads = np.array([np.ptp(signal, axis=0) for signal in signals])
+        spreads = np.array([_spread(signal) for signal in signals])
         close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
         wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
         size = np.abs(means)

@@ -66,6 +66,8 @@ _AMONG = 1.3  # of modes without effect, relative to the mean: no pole's own
 _EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
+_POINTS, _OF_ROUNDING = 20, 1e-12  # at which a trace is zero, relative to its matrix
+
 # A parameter is at a flat point where a change of its size, one at least, changes the
 # response by less; decades about one of its starts elsewhere.
 _FLAT, _DECADES = 1e-4, 3.0
@@ -127,6 +129,14 @@ def search(
             f"{', '.join(silent)}, which change nothing: an input or an output may be "
             "missing in B, C or D."
         )
+    if _never_decays(problem, np.random.default_rng(seed)):
+        raise ValueError(
+            "`structure` must have parameters of a model that decays. Got one that "
+            "never does: the sum of its poles, the trace of A, is negative for no "
+            "parameters (within their bounds). Add damping, as '-c' on the diagonal of "
+            "A or `D` of equations of motion; where it is small, bound it by what is "
+            "known of it."
+        )
     begun = given if only_given else [guess]
     worst = None if begun[0] is None else _worst_pole(problem, begun[0])
     if worst is not None:
@@ -154,6 +164,28 @@ def _worst_pole(problem: RestructuringProblem, theta: Array) -> complex | None:
     rates = growth(poles, problem.system.dt)
     grows = np.isfinite(poles).all() and rates.max(initial=-np.inf) >= 0
     return complex(poles[np.argmax(rates)]) if grows else None
+
+
+def _never_decays(problem: RestructuringProblem, rng: np.random.Generator) -> bool:
+    """Whether the trace of A(theta) in continuous time is negative for no parameters.
+
+    Of an affine structure by its bounds. Others, analytic in their parameters, have
+    the trace zero everywhere if they have at any random points, but for rounding.
+    """
+    structure, n = problem.structure, problem.structure.order
+    if problem.system.dt is not None or n == 0:
+        return False
+    if isinstance(structure.map, AffineMap):
+        offset, basis = structure.map.offset, structure.map.basis
+        slopes = np.trace(basis[:, :n, :n], axis1=1, axis2=2)
+        ends = np.where(slopes > 0.0, structure.lower, structure.upper)
+        moves = slopes != 0.0
+        least = np.trace(offset[:n, :n]) + slopes[moves] @ ends[moves]
+        return bool(least >= 0.0)
+    shape = _POINTS, structure.n_params
+    points = np.clip(rng.normal(size=shape), structure.lower, structure.upper)
+    matrices = [structure.map.system_matrix(theta)[:n, :n] for theta in points]
+    return all(abs(np.trace(A)) <= _OF_ROUNDING * np.abs(A).max() for A in matrices)
 
 
 def _without_effect(

@@ -513,7 +513,7 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
     bend = find_bend(fitted.evidence)
     if bend is None:
         return
-    if bend.by_direction:
+    if bend.cause == "direction":
         telling.once(
             "bent",
             f"The errors of output {telling.output(bend.output)} follow the direction "
@@ -524,6 +524,18 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
             "system well beyond the play and seldom turn, or measure behind what has "
             "the play and give that as the input. Where inputs were measured with "
             "noise, which looks the same, give what was commanded.",
+        )
+    elif bend.cause == "change":
+        telling.once(
+            "bent",
+            f"The errors of output {telling.output(bend.output)} follow large changes "
+            "of the inputs more than in proportion, beyond chance and by more than a "
+            "little, as an actuator makes them whose rate is limited (slew rate): the "
+            "model, which stands in for the system over changes like those of this "
+            "record, simulates smaller and larger ones worse. Use steps or speeds of "
+            "the inputs that are small enough, or give the measured position of the "
+            "actuator as the input. Where inputs were measured with noise, which looks "
+            "the same, give what was commanded.",
         )
     else:
         telling.once(

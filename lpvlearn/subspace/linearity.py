@@ -4,7 +4,9 @@ Squares and cubes of the inputs, and of what a model answers to these from rest,
 through its modes as inputs do. Of the errors of a linear system in open loop they
 explain nothing, whatever its noise is: both are given by the inputs (after Ramsey,
 *Journal of the Royal Statistical Society B* 31, 1969). Nor does what signals lose in
-play: that of backlash, and nearly the sign of their rates, by which friction acts. What
+play: that of backlash, and nearly the sign of their rates, by which friction acts. Nor
+do cubes of changes of the inputs: of a step h, an actuator whose rate is limited to R
+misses the area ``h |h| / (2 R)``, which grows with h more than in proportion. What
 lagged inputs explain, and the signals themselves, is taken from all of them before:
 states that a model lacks are another thing. So is what initial states and trends do:
 where little is left of slow noise, much of that is of the first samples.
@@ -52,12 +54,23 @@ _BENT_SAMPLES, _ROWS_PER_TERM, _SLOWEST, _LAGGED = 2_048, 2, 4, 50
 
 _PLAY = (0.1, 0.5)  # standard deviations of a signal, to each side
 
+# Samples over which inputs change, at most those of the lags that are known.
+_CHANGES = (1, 4, 16)
+
+# Of the errors as they are, not filtered, more than that share is no chance of slow
+# noise: limits of rate and size explain 0.45 to 0.95 in the other half of a record;
+# noise that grows with the output, or in a loop that nobody found, less than 0.3.
+# Large changes must explain that much.
+_CLEARLY = 0.4
+
+_CAUSES = ("size", "direction", "change")
+
 
 class Bend(NamedTuple):
     """An output whose errors follow what no linear system does."""
 
     output: int
-    by_direction: bool  # of motion, as friction and backlash do
+    cause: str  # size, direction of motion (friction, backlash), or change of inputs
 
 
 class _Terms(NamedTuple):
@@ -65,15 +78,15 @@ class _Terms(NamedTuple):
 
     own: Array  # (n_rows, n_outputs, n_own), by initial states and trends
     linear: Array
-    powers: Array
-    lost_in_play: Array
+    bent: list[Array]  # for each of the causes
 
 
 @one_blas_thread
 def find_bend(evidence: Evidence) -> Bend | None:
     """The first output whose errors clearly are bent, and not just by a little.
 
-    By powers of signals, or else by what these lose in play. Errors of a model that is
+    By powers of signals, by what these lose in play, or by large changes of the inputs,
+    whichever explains most. Errors of a model that is
     unstable may be anything, and are not looked at.
     """
     poles = np.linalg.eigvals(evidence.model.A).astype(complex)
@@ -104,26 +117,38 @@ def find_bend(evidence: Evidence) -> Bend | None:
     centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
     m = inputs[0].shape[1]
     n_lags = min(N_LAGS, _LAGGED // m, len(whole) // (WINDOWS_PER_LAG * m))
-    terms = []
+    terms, scale = [], np.where(moves[:m], whole[:, :m].std(axis=0), 1.0)
     for u, z in zip(inputs, moved, strict=True):
         z = (z[:, moves] - centre) / spread
         late = [delayed(u, np.full(m, k)) for k in range(n_lags + 1)]
         linear = [through_modes(poles, u, 2), *late, through_modes(poles, z), z]
         powers = np.hstack([z**power for power in _POWERS])
         lost = np.hstack([z - _play(z, radius) for radius in _PLAY])
-        parts = (
-            free_responses(A, C, len(u), trend_signals(len(u), 2)),
-            np.hstack(linear),
-            np.hstack([through_modes(poles, powers), powers]),
-            np.hstack([through_modes(poles, lost), lost]),
+        bent = (powers, lost, _large_changes(u / scale, n_lags))
+        own = free_responses(A, C, len(u), trend_signals(len(u), 2))
+        terms.append(  # of inputs that are known
+            _Terms(
+                own[n_lags:],
+                np.hstack(linear)[n_lags:],
+                [np.hstack([through_modes(poles, x), x])[n_lags:] for x in bent],
+            )
         )
-        terms.append(_Terms(*(x[n_lags:] for x in parts)))  # of inputs that are known
     errors = [e[n_lags:] for e in errors]
     for i in large:
-        by_direction = _bend(terms, [e[:, i] for e in errors], i, least[i])
-        if by_direction is not None:
-            return Bend(i, by_direction)
+        cause = _bend(terms, [e[:, i] for e in errors], i, least[i])
+        if cause is not None:
+            return Bend(i, cause)
     return None
+
+
+def _large_changes(inputs: Array, most: int) -> Array:
+    """Cubes of changes of inputs of a common size, over `most` samples at most.
+
+    Of inputs with two levels they are changes, and lagged inputs explain them.
+    """
+    m = inputs.shape[1]
+    lags = [np.full(m, k) for k in sorted({min(k, most) for k in _CHANGES})]
+    return np.hstack([(inputs - delayed(inputs, lag)) ** 3 for lag in lags])
 
 
 def _play(signals: Array, radius: float) -> Array:
@@ -140,24 +165,20 @@ def _play(signals: Array, radius: float) -> Array:
 
 def _bend(
     terms: Sequence[_Terms], errors: Sequence[Array], output: int, least: float
-) -> bool | None:
-    """Whether what signals lose in play explains more of an output than `least`.
-
-    False where powers do, None where neither does.
-    """
+) -> str | None:
+    """The cause that explains most of an output, where that is more than `least`."""
     n_linear, n_own = terms[0].linear.shape[1], terms[0].own.shape[2]
-    n_powers, n_lost = terms[0].powers.shape[1], terms[0].lost_in_play.shape[1]
+    sizes = [x.shape[1] for x in terms[0].bent]
     signals = [
-        np.column_stack(
-            [one.own[:, output], one.linear, one.powers, one.lost_in_play, e]
-        )
+        np.column_stack([one.own[:, output], one.linear, *one.bent, e])
         for one, e in zip(terms, errors, strict=True)
     ]
     # What is left of the errors is filtered: what the model lacks is no noise.
     columns = _rows(signals, np.ones(1), n_own)
-    if len(columns) < _ROWS_PER_TERM * (n_linear + max(n_powers, n_lost) + 1):
+    if len(columns) < _ROWS_PER_TERM * (n_linear + max(sizes) + 1):
         return None
-    noise = without(of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
+    plain = without(of_size_one(columns[:, :n_linear]), columns[:, n_linear:])[0]
+    noise = plain[:, -1:]
     if not noise.std() > least:
         return None
     stops = np.cumsum([len(part) for part in signals])[:-1]
@@ -165,13 +186,19 @@ def _bend(
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
-    for by_direction, bent in enumerate((left[:, :n_powers], left[:, n_powers:-1])):
-        if not f_test(bent, left[:, -1], n).p_value < BEYOND_CHANCE:
-            continue
-        explained = _explained_elsewhere(np.column_stack([bent, left[:, -1]]))
-        if explained * noise.var() > least**2:
-            return bool(by_direction)
-    return None
+    most, found = least**2 / noise.var(), None
+    stops = np.cumsum([0, *sizes])
+    for cause, first, stop in zip(_CAUSES, stops[:-1], stops[1:], strict=True):
+        which = [*range(first, stop), -1]
+        if f_test(left[:, first:stop], left[:, -1], n).p_value < BEYOND_CHANCE:
+            explained = _explained_elsewhere(left[:, which])
+            if explained > 0.0:  # of what is slow the filter leaves little
+                whole = _explained_elsewhere(plain[:, which])
+                explained = explained if cause != "change" else 0.0
+                explained = whole if whole > _CLEARLY else explained
+            if explained > most:
+                most, found = explained, cause
+    return found
 
 
 def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:

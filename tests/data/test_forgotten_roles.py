@@ -88,6 +88,17 @@ def test_other_inputs_are_not_suspected(name):
     assert warned(table(v=INPUTS[name]).drop(columns="run")) == []
 
 
+@pytest.mark.parametrize("rows", [30, 125, 200])
+@pytest.mark.parametrize("low", [-1.0, 0.0])
+def test_a_sawtooth_is_an_input(rows, low):
+    teeth = low + np.arange(1500) % rows / rows
+    for column in (teeth, -teeth, teeth + 0.001 * np.arange(1500) / rows):
+        assert warned(pd.DataFrame({"u": column})) == []
+    if low < 0.0:
+        beside = pd.DataFrame({"u": teeth, "v": np.sin(np.arange(1500.0) ** 1.5)})
+        assert warned(beside) == []
+
+
 def test_who_names_the_inputs_is_not_doubted():
     X = table(clock=CLOCKS["time"])
     assert warned(X, experiment="run", inputs=["u", "clock"]) == []

@@ -11,6 +11,8 @@ from lpvlearn.data.operating_points import (
     _check_local,
     check_outputs,
     group_operating_points,
+    local_experiments,
+    moving_experiments,
     without_spikes,
 )
 
@@ -145,9 +147,61 @@ def test_a_single_sweep_is_not_local():
 
 
 def _record(signal, label=0):
-    signal = np.asarray(signal, float)[:, None]
+    signal = np.asarray(signal, float).reshape(len(signal), -1)
     rows = np.arange(len(signal))
     return Experiment(label, rows, np.ones((len(rows), 1)), scheduling=signal)
+
+
+@pytest.mark.parametrize(
+    ("points", "noise"),
+    [
+        (np.linspace(0.0, 2.0, 12), 0.06),
+        (np.repeat(np.linspace(0.0, 2.0, 8), 2), 0.05),
+        ([0.0, 0.15, 1.0, 1.15, 2.0, 2.15], 0.06),
+        ([0.0, 0.1, 0.2, 1.0, 1.1, 1.2, 2.0], 0.1),
+        ([0.0, 0.2], 0.05),
+    ],
+)
+def test_white_noise_of_a_sensor_joins_no_points(points, noise):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        runs = [
+            _record(value + noise * rng.standard_normal(400), k)
+            for k, value in enumerate(points)
+        ]
+        found = local_experiments(runs)
+        np.testing.assert_allclose(found.kappa[:, 0], np.unique(points), atol=0.02)
+        assert moving_experiments(runs) == (runs, [])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("turns", [0.25, 1.0, 3.0, 20.0])
+def test_what_moves_is_no_noise(turns, noise):
+    rng = np.random.default_rng(int(turns))
+    motion = 0.3 * np.sin(2.0 * np.pi * turns * np.linspace(0.0, 1.0, 400))
+    signals = [k + noise * rng.standard_normal(400) for k in (0.0, 0.5, 1.0)]
+    runs = [_record(signal, k) for k, signal in enumerate(signals)]
+    runs[1] = _record(signals[1] + motion, 1)
+    with pytest.raises(ValueError, match="Experiment 1 must be local"):
+        local_experiments(runs)
+    assert moving_experiments(runs)[1] == [runs[1]]
+
+
+def test_a_variable_that_tells_no_points_apart_is_to_be_left_out():
+    rng = np.random.default_rng(0)
+    drift = np.linspace(-0.005, 0.005, 400)
+    runs = [
+        _record(np.column_stack([np.full(400, k), h + drift]), k)
+        for k, h in enumerate(5.0 + 0.003 * rng.standard_normal(6))
+    ]
+    with pytest.raises(ValueError, match="Variable 2 hardly differs.*leave it out"):
+        local_experiments(runs)
+    drifting = replace(
+        runs[0], scheduling=runs[0].scheduling + [100.0, 0.0] * drift[:, None]
+    )
+    with pytest.raises(ValueError, match="must be local") as raised:
+        _check_local([drifting, *runs[1:]], np.array([[0.0, 0.0], [1.0, 9.0]]))
+    assert "leave it out" not in str(raised.value)
 
 
 def test_spikes_of_scheduling_variables_are_replaced_and_told():

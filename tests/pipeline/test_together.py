@@ -11,6 +11,7 @@ from lpvlearn.pipeline.structured_models import StructuredModels
 from lpvlearn.pipeline.together import (
     _along_the_points,
     _may_have,
+    _misfit,
     fitted_together,
     through_black_boxes,
 )
@@ -104,6 +105,12 @@ def test_a_form_that_the_black_boxes_refute_is_not_kept():
     with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
         form, _, _ = through_black_boxes(rough, structured(TRUTH, P))
     assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-5)
+
+
+def test_what_is_far_from_the_black_boxes_is_infinitely_far():
+    own = boxes([[estimate(theta)] for theta in TRUTH])
+    assert _misfit(own, TRUTH) < 1e-9
+    assert _misfit(own, TRUTH * [1.0, 1e200, 1.0, 1.0]) == np.inf  # silently
 
 
 @pytest.mark.parametrize("outward", [True, False])

@@ -77,6 +77,46 @@ def test_what_keeps_a_search_from_starting_is_told():
         GrayBoxRestructurer(unstable).fit_model(StateSpace(0.5, 3, 1, None, 1.0))
 
 
+def undamped(**bounds):
+    plain = [[0, 1], ["-k", 0]], [[0], ["b"]], [[1, 0]]
+    return GrayBoxStructure.from_template(*plain).with_bounds(bounds)
+
+
+def undamped_masses():
+    K = [["k1 + k2", "-k2"], ["-k2", "k2"]]
+    return GrayBoxStructure.mechanical(
+        M=[["m", 0], [0, 1]], D=[[0, 0], [0, 0]], K=K, F=[[1], [0]], sensors=[[0, 1]]
+    )
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        undamped(),
+        undamped(k=(0.1, 50.0)),
+        undamped_masses(),
+        GrayBoxStructure.from_template([["a"]], [["b"]], [[1]]).with_bounds(
+            {"a": (2, 3)}
+        ),
+        GrayBoxStructure.from_template(
+            [["a", 1], ["-k", "-a"]], [[0], ["b"]], [[1, 0]]
+        ),
+    ],
+)
+def test_a_structure_that_never_decays_is_told(structure):
+    box = spring_structure().model([30.0, 1.2, 40.0])
+    with pytest.raises(ValueError, match="`structure` must .* decays.* Add damping"):
+        GrayBoxRestructurer(structure).fit_model(box)
+
+
+def test_a_pole_that_grows_beside_one_that_decays_is_no_lack_of_damping():
+    structure = GrayBoxStructure.from_template(
+        [["c", 1], [0, "1.5 + 2*c"]], [[1], ["b"]], [[1, 0]]
+    ).with_bounds({"c": (-0.6, -0.5)})
+    with pytest.raises(ValueError, match="no stable starting point"):
+        GrayBoxRestructurer(structure).fit_model(spring_structure().model([30, 1.2, 4]))
+
+
 def test_an_unstable_first_guess_is_named_with_its_pole():
     box, wrong = spring_structure().model([30, 1.2, 40]), [-1.0, -1.0, -1.0]
     with pytest.raises(ValueError, match=r"`init` must.* pole at 1.618\+0j"):

@@ -1,10 +1,13 @@
 """Systems that bend are told of, and no noise makes a linear one seem to."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.subspace.linearity import _large_changes
 
 from ..conftest import modes
 from .test_residuals import coloured
@@ -53,6 +56,47 @@ def test_a_fit_tells_of_backlash(at_input, smooth):
     y += 0.01 * y.std() * rng.standard_normal(y.shape)
     with pytest.warns(UserWarning, match="of output 1 follow the direction"):
         SubspaceLTI(3, offset=None).fit(u, y)
+
+
+def at_limited_rate(signal, rate):
+    place, places = 0.0, []
+    for value in signal:
+        place += min(max(value - place, -rate), rate)
+        places.append(place)
+    return np.array(places)
+
+
+def told_of(u, y):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        SubspaceLTI(2, offset=None).fit(u, y)
+    return [str(one.message) for one in told]
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.15])
+@pytest.mark.parametrize("pole", [0.9 + 0.2j, 0.7 + 0.1j])
+def test_a_fit_tells_of_an_actuator_of_limited_rate(rate, pole):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 50), 40)
+    system = StateSpace(modes(pole), [[0.0], [1.0]], [[0.3, 0.0]], [[0.0]], 1.0)
+    y = system.simulate(at_limited_rate(u, rate)[:, None])
+    y += 0.02 * y.std() * rng.standard_normal(y.shape)
+    bent = [message for message in told_of(u[:, None], y) if "1 follow" in message]
+    assert len(bent) == 1 and "large changes" in bent[0] and "slew rate" in bent[0]
+
+
+def test_of_two_levels_a_limited_rate_is_as_linear_as_any():
+    rng = np.random.default_rng(3)
+    levels = rng.choice([-1.0, 1.0], (2_000, 1))
+    moves = _large_changes(levels, 25)
+    lags = [np.roll(levels, k, axis=0) for k in (0, 1, 4, 16)]
+    left = np.linalg.lstsq(np.hstack(lags)[16:], moves[16:])[1]
+    assert (left < 1e-20 * np.sum(moves**2)).all()
+    u = np.repeat(rng.choice([-1.0, 1.0], (50, 1)), 40, axis=0)
+    system = StateSpace(modes(0.9 + 0.2j), [[0.0], [1.0]], [[0.3, 0.0]], [[0.0]], 1.0)
+    y = system.simulate(at_limited_rate(u[:, 0], 0.1)[:, None])
+    y += 0.02 * y.std() * rng.standard_normal(y.shape)
+    assert not any("of output 1 follow" in message for message in told_of(u, y))
 
 
 @pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
