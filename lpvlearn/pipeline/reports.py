@@ -89,6 +89,7 @@ def tables(
     index = pd.Index(labels, name="operating_point", tupleize_cols=False)
     names = pd.Index(found.structure.parameter_names)
     interpolated = lpv.parameters(points.kappa)
+    unit = _sizes(theta)
     deviations = pd.DataFrame(spread, index, list(names))
 
     missed = False
@@ -133,7 +134,9 @@ def tables(
         # infinite with integrators, whose gains need not agree
         known = 0 < size < np.inf
         row["interpolation_error"] = distance / size if known else np.nan
-        row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
+        row["interpolation_FIT"] = parameter_fit(
+            theta[k] / unit, interpolated[k] / unit
+        )
         row["growth_rate"] = growth[k]
         if found.restructurers:
             row |= dict(zip("param_" + names, theta[k], strict=True))
@@ -368,7 +371,9 @@ def summarise(
         )
     distance = 100 * report["interpolation_error"]
     form = getattr(lpv.interpolator, "form_", "")
-    fit = parameter_fit(found.parameters, lpv.parameters(kappa))
+    theta = found.parameters.to_numpy()
+    size = _sizes(theta)
+    fit = parameter_fit(theta / size, lpv.parameters(kappa) / size)
     lines += [
         f"Interpolation: {lpv.interpolator}{form and f' ({form})'}, "
         f"parameter fit (FIT) {fit:.2f} %",
@@ -392,6 +397,12 @@ def summarise(
     if restructured:
         parameters = readable_report(found.by_parameter.dropna(axis=1, how="all"))
     return Summary(lines, readable_report(report[shown]), parameters)
+
+
+def _sizes(theta: Array) -> Array:
+    """Root mean square of every parameter: together they count alike in any unit."""
+    size = np.sqrt(np.mean(theta**2, axis=0))
+    return np.where(size > 0.0, size, 1.0)
 
 
 def _span(values: pd.Series) -> str:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.base import clone
 
 from lpvlearn import (
     AutoLPV,
@@ -15,10 +16,7 @@ from lpvlearn import (
     parameter_fit,
 )
 
-from ..conftest import (
-    spring_pipeline,
-    spring_tables,
-)
+from ..conftest import ROLES, spring_pipeline, spring_structure, spring_tables
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +68,9 @@ def test_the_report_holds_the_parameters_and_their_interpolation(fitted):
         report[[f"param_{n}" for n in names]], fitted.parameters_
     )
     met = fitted.interpolator_.predict(fitted.operating_points_)
+    size = np.sqrt((fitted.parameters_**2).mean()).to_numpy()
     expected = [
-        parameter_fit(own, other)
+        parameter_fit(own / size, other / size)
         for own, other in zip(fitted.parameters_.to_numpy(), met, strict=True)
     ]
     np.testing.assert_allclose(report["interpolation_FIT"], expected)
@@ -81,6 +80,20 @@ def test_the_report_holds_the_parameters_and_their_interpolation(fitted):
     )
     relative = distance.hinf_norm() / fitted.structured_models_[k].hinf_norm()
     assert report["interpolation_error"].iloc[k] == pytest.approx(relative)
+
+
+def test_the_fit_of_parameters_does_not_depend_on_units():
+    """Of time, say: the largest number would decide."""
+    X, y = spring_tables(noise=0.01, n_samples=300)
+    restructurer = GrayBoxRestructurer(spring_structure())
+    pipeline = LocalLPVPipeline(None, restructurer, PolynomialLPV(1), **ROLES)
+    own, other = (
+        clone(pipeline).fit(X.assign(time=unit * X["time"]), y) for unit in (1.0, 1e3)
+    )
+    fits = [model.report_["interpolation_FIT"] for model in (own, other)]
+    np.testing.assert_allclose(*fits, rtol=1e-6)
+    line = [model.summary().split("parameter fit")[1][:14] for model in (own, other)]
+    assert line[0] == line[1]
 
 
 def test_parameters_are_reported_one_by_one(fitted):
