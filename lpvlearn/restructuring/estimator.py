@@ -920,15 +920,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
         error = min(self.fit_error_, self.relative_error_) - floor
         if error > max(_POOR_FIT, enough) and not explained:
-            costs = self.starts_["relative_error"].to_numpy()
-            agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
             warn(
                 f"the structure comes no nearer than {100 * self.fit_error_:.2g} % "
-                f"(root mean square over frequency) to the black box; {agreeing} of "
-                f"{len(costs)} fits from different starts end there. "
+                f"(root mean square over frequency) to the black box; {together} of "
+                f"{len(errors)} fits from different starts end there. "
                 + (
                     "It probably cannot represent the model any better."
-                    if agreeing > 1
+                    if together > 1
                     else "Either it cannot represent the model, or the search ended in "
                     "a wrong basin."
                 )

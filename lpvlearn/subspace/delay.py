@@ -181,9 +181,8 @@ def find_delays(
     delay = longest_delays(pairs, np.any(settings.free.direct, axis=0))
     if not delay.any():
         return delay
-    if settings.method != "pbsid":
-        lengths = [len(u) - int(delay.max()) for u, _ in pairs]
-        settings.check_size(lengths, order, horizon)
+    lengths = [len(u) - int(delay.max()) for u, _ in pairs]
+    settings.check_size(lengths, order, horizon)
     settings = settings._replace(
         free=settings.free._replace(initial_states=True),
         refine=True,
