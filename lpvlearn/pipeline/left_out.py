@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import clone
 
 from ..data.operating_points import neighbours
 from ..exceptions import warn
@@ -138,7 +139,7 @@ def _differences_between(
     if form.kind != "pchip" or not np.ptp(kappa, axis=0).any():
         return
     pairs = neighbours(kappa)
-    smooth = SplineLPV("cubic", scale=form.scale).fit(kappa, theta)
+    smooth = clone(form).set_params(kind="cubic").fit(kappa, theta)
     own, other = (f.predict(kappa[pairs].mean(axis=1)) for f in (form, smooth))
     for (k, at), *parameters in zip(pairs.tolist(), other, own, strict=True):
         with suppress(ValueError):  # beyond the points a structure may have no model
