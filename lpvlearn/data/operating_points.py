@@ -49,6 +49,7 @@ _NAMED = 3  # experiments that a message lists
 # standard deviations of such a variance, 2.15 / sqrt(n). Third differences of what
 # moves are far smaller than what means take away of it, unless it turns every sample.
 _DIFFERENCES, _OF_DIFFERENCES, _BY_CHANCE = 3, 20.0, 6.5
+_UNUSUAL = 4.0  # times the median of these variances over the records: no noise
 _HIDDEN = 4  # windows of a record in which a motion may hide behind noise
 _WINDOWS = tuple(2**k + 1 for k in range(1, 24))  # samples, odd: about one of them
 
@@ -184,12 +185,15 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
     points.
     """
     extent = np.ptp(kappa, axis=0)
-    for run in experiments:
-        if run.scheduling is None or run.scheduling.shape[1] == 0:
-            continue
-        spread, reach = _spread(run.scheduling, _HIDDEN), np.ptp(run.scheduling, axis=0)
-        scale = np.where(extent > 0, extent, np.abs(run.scheduling).max(axis=0))
-        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * reach)
+    if not extent.size:
+        return
+    known = [run for run in experiments if run.scheduling is not None]
+    signals = [run.scheduling for run in known if run.scheduling is not None]
+    spreads = _spreads(signals, _HIDDEN)
+    for run, signal, spread in zip(known, signals, spreads, strict=True):
+        reach = np.ptp(signal, axis=0)
+        scale = np.where(extent > 0, extent, np.abs(signal).max(axis=0))
+        travels = (extent > 0) | (_travel(signal) > _SWEEP * reach)
         excess = np.where(travels, spread - _MAX_SPREAD * scale, 0.0)
         worst = int(np.argmax(excess))
         if excess[worst] > 0:
@@ -200,7 +204,7 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 if len(experiments) == 1
                 else ""
             )
-            if _says_nothing(experiments, extent)[worst]:
+            if _says_nothing(spreads, extent)[worst]:
                 several = (
                     f" Variable {worst + 1} hardly differs between the points, compared"
                     " with how it moves within them: leave it out of `scheduling`."
@@ -214,12 +218,12 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 "refine the model with it: refiner=OutputErrorLPV(). For an angle that "
                 f"turns over, take its cosine and sine.{several}"
             )
-        changes = np.count_nonzero(np.diff(run.scheduling, axis=0), axis=0)
+        changes = np.count_nonzero(np.diff(signal, axis=0), axis=0)
         steps = (changes > 0) & (changes <= min(_FEW_STEPS, len(run.rows) // _STILL))
         steps &= (extent > 0) & (reach > _STEP * extent)
         if steps.any():
             k = int(steps.argmax())
-            first, last = run.scheduling[[0, -1], k]
+            first, last = signal[[0, -1], k]
             raise ValueError(
                 f"Experiment {run.label!r} must be at one operating point. Got a "
                 f"scheduling variable {k + 1} that steps from {first:.4g} to "
@@ -228,16 +232,12 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
             )
 
 
-def _says_nothing(
-    experiments: Sequence[Experiment], extent: Array
-) -> NDArray[np.bool_]:
+def _says_nothing(spreads: Array, extent: Array) -> NDArray[np.bool_]:
     """Variables that tell no points apart, where another one does.
 
     Within most experiments they move too far, for the `extent` of the points.
     """
-    signals = [run.scheduling for run in experiments if run.scheduling is not None]
-    usual = np.median([_spread(signal, _HIDDEN) for signal in signals], axis=0)
-    silent = usual > _MAX_SPREAD * extent
+    silent = np.median(spreads, axis=0) > _MAX_SPREAD * extent
     return silent & ((extent > 0) & ~silent).any()
 
 
@@ -253,7 +253,7 @@ def moving_experiments(
     if any(run.scheduling is None for run in experiments):
         return list(experiments), []
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
-    spread = np.array([_spread(signal, _HIDDEN) for signal in signals])
+    spread = _spreads(signals, _HIDDEN)
     reach = np.array([np.ptp(signal, axis=0) for signal in signals])
     between = np.ptp([signal.mean(axis=0) for signal in signals], axis=0)
     travel = np.array([_travel(signal) for signal in signals])
@@ -279,9 +279,29 @@ def _motion(experiments: Sequence[Experiment]) -> Array:
     return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def _spread(scheduling: Array, n_windows: int = _PARTS) -> Array:
-    """Maximum minus minimum of each column, of its means where these lose noise only.
+def _spreads(signals: Sequence[Array], n_windows: int = _PARTS) -> Array:
+    """Maximum minus minimum of the columns of signals, of means that lose noise only.
+
+    (n_signals, n_scheduling). That of the sensor is in all of them: what one has beyond
+    a few times the usual is motion.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        noise = np.array([_white_noise(signal) for signal in signals])
+        noise = np.minimum(noise, _UNUSUAL * np.median(noise, axis=0))
+        pairs = zip(signals, noise, strict=True)
+        return np.array([_spread(*pair, n_windows) for pair in pairs])
+
+
+def _white_noise(scheduling: Array) -> Array:
+    """Variance of white noise of each column, if it has no other fast motion."""
+    if len(scheduling) <= _DIFFERENCES:
+        return np.zeros(scheduling.shape[1])
+    differences = np.diff(scheduling, _DIFFERENCES, axis=0)
+    return np.asarray((differences**2).mean(axis=0) / _OF_DIFFERENCES)
+
+
+def _spread(scheduling: Array, noise: Array, n_windows: int) -> Array:
+    """Of one signal, whose noise has these variances, if it has.
 
     So many windows make up the record, at least: with many of them means of experiments
     at one point differ by less, with few of them the motion is known best. A straight
@@ -292,8 +312,6 @@ def _spread(scheduling: Array, n_windows: int = _PARTS) -> Array:
         return spread
     centred = scheduling - scheduling.mean(axis=0)
     sums = np.cumsum(np.vstack([np.zeros_like(centred[:1]), centred]), axis=0)
-    differences = np.diff(centred, _DIFFERENCES, axis=0)
-    noise = (differences**2).mean(axis=0) / _OF_DIFFERENCES
     only_noise = noise > (_ROUNDING * spread) ** 2
     for window in _WINDOWS:
         if window > n // n_windows:
@@ -369,7 +387,7 @@ def _tolerance(
 ) -> tuple[Array, Array]:
     """Of every pair of experiments (n, n, n_scheduling), and the largest."""
     if tol is None:
-        spreads = np.array([_spread(signal) for signal in signals])
+        spreads = _spreads(signals)
         close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
         wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
         size = np.abs(means)

@@ -122,7 +122,7 @@ def _may_gain(measured: Array, simulated: Array) -> bool:
         mean = measured.sum(axis=0, where=known) / known.sum(axis=0)
         size = np.linalg.norm(np.where(known, measured - mean, 0.0), axis=0)
         shares = np.linalg.norm(error, axis=0) / size
-        return bool(100.0 * np.mean(np.minimum(shares, 1.0)) > _GAIN)
+        return not 100.0 * np.mean(np.minimum(shares, 1.0)) <= _GAIN  # or NaN
 
 
 def _starts_in_motion(

@@ -158,7 +158,8 @@ class SplineLPV(Interpolator):
     def _carried(self, outer: Array, kappa: Array) -> Array:
         x, (n, q) = self._varying(self._unit(kappa)), self._theta.shape
         if isinstance(self._curve, PchipInterpolator):  # its slopes follow the values
-            nodes, units = self._nodes[:, 0], np.eye(n)[:, :, None].repeat(q, axis=2)
+            nodes = self._varying(self._nodes)[:, 0]
+            units = np.eye(n)[:, :, None].repeat(q, axis=2)
             changes = _pchip_slope_changes(nodes, self._theta)
             curve = CubicHermiteSpline(nodes, units, changes)
         else:

@@ -69,6 +69,9 @@ _SCOUTS, _FEWER, _MORE = 3, 2, 2
 # resonance and two drifts.
 _OF_LOADS = 4
 
+# Decrease of the criterion from which they are taken: below it they were not better.
+_LIKELIER = 10.0
+
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
     "controller's reference as input and the controller in the structure. "
@@ -826,21 +829,22 @@ def _fit_with_loads(
     fitted: Any,
     experiments: Sequence[Experiment],
     sampling_time: float,
-    asked: float = 0.0,
+    asked: float = _LIKELIER,
 ) -> tuple[Any, list[Told]] | None:
     """A likelier model of more states than the fitted one, and what is told of it.
 
     In a loop plant and noise share their states, and what inputs know of a disturbance
     is one more: with as many as the plant has alone, the likeliest ones are those of
-    the disturbance as well. None where more are not worth what they cost, or not by
-    as much as is `asked`.
+    the disturbance as well. None where more are not worth what they cost, by as much
+    as is `asked`, or grow.
     """
     order = local.get_params(deep=False)["order"]
     more = clone(local).set_params(order=range(order, order + _OF_LOADS + 1))
     with collected() as told, suppress(ValueError):
         other = _fit_local(more, experiments, sampling_time)
         known, its = (_criterion(getattr(f, "rates_", f)) for f in (fitted, other))
-        if other.order_ > fitted.order_ and its < known - asked:
+        grows = fitted.lti_.is_stable and not other.lti_.is_stable
+        if other.order_ > fitted.order_ and its < known - asked and not grows:
             return other, told
     return None
 

@@ -87,7 +87,7 @@ _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 # Of the H-infinity norm's own, and of the black box: an error that is larger by both is
 # none that weighing by the uncertainty of the black box should lead to.
-_ASTRAY, _FAR = 10.0, 0.1
+_ASTRAY, _FAR = 10.0, 0.5
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has

@@ -57,10 +57,10 @@ _PLAY = (0.1, 0.5)  # standard deviations of a signal, to each side
 # Samples over which inputs change, at most those of the lags that are known.
 _CHANGES = (1, 4, 16)
 
-# Of the errors as they are, not filtered, more than that share is no chance of slow
-# noise: limits of rate and size explain 0.45 to 0.95 in the other half of a record;
-# noise that grows with the output, or in a loop that nobody found, less than 0.3.
-# Large changes must explain that much.
+# Of the errors as they are, not filtered, large changes must explain that share, which
+# is no chance of slow noise: limits of rate explain 0.45 to 0.95 in the other half of a
+# record; noise that grows with the output, or in a loop that nobody found, less than
+# 0.3.
 _CLEARLY = 0.4
 
 _CAUSES = ("size", "direction", "change")
@@ -186,19 +186,17 @@ def _bend(
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
-    most, found = least**2 / noise.var(), None
+    causes: dict[str, float] = {}
     stops = np.cumsum([0, *sizes])
     for cause, first, stop in zip(_CAUSES, stops[:-1], stops[1:], strict=True):
         which = [*range(first, stop), -1]
         if f_test(left[:, first:stop], left[:, -1], n).p_value < BEYOND_CHANCE:
             explained = _explained_elsewhere(left[:, which])
-            if explained > 0.0:  # of what is slow the filter leaves little
-                whole = _explained_elsewhere(plain[:, which])
-                explained = explained if cause != "change" else 0.0
-                explained = whole if whole > _CLEARLY else explained
-            if explained > most:
-                most, found = explained, cause
-    return found
+            whole = _explained_elsewhere(plain[:, which])
+            slow = explained > 0.0 and whole > _CLEARLY
+            if slow if cause == "change" else explained * noise.var() > least**2:
+                causes[cause] = whole
+    return max(causes, key=lambda cause: causes[cause], default=None)
 
 
 def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:

@@ -244,3 +244,16 @@ def test_measured_outputs_are_looked_at_one_experiment_at_a_time():
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 50 * 20_000 * 8 / 4
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("n", [40, 300, 3000])
+def test_what_one_record_alone_has_is_no_noise_of_the_sensor(n, noise):
+    """Levels that are new in every sample look like white noise."""
+    rng = np.random.default_rng(0)
+    new = rng.uniform(-1, 1, n), np.sign(rng.standard_normal(n))
+    for moving in (*new, np.sin(2.1 * np.arange(n))):
+        values = [np.full(n, place) for place in (-1.0, -0.3, 0.3, 1.0)] + [moving]
+        noisy = [x + noise * rng.standard_normal(n) for x in values]
+        runs = [_record(signal, k) for k, signal in enumerate(noisy)]
+        assert moving_experiments(runs)[1] == [runs[-1]]

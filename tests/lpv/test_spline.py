@@ -134,3 +134,15 @@ def test_a_variable_of_one_value_changes_nothing(kind):
     np.testing.assert_array_equal(beside.predict(both), alone.predict(places))
     slopes = alone.sensitivities(places)
     np.testing.assert_array_equal(beside.sensitivities(both), slopes)
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_slopes_follow_the_values_over_any_variable(scale):
+    kappa = np.column_stack([np.linspace(-1, 1, 5) ** 3, np.geomspace(1, 9, 5)])
+    theta = np.array([1.0, 3.0, 2.0, 4.0, 4.5])
+    curve = SplineLPV(scale=scale, variables=[1]).fit(kappa, theta)
+    alone = SplineLPV(scale=scale).fit(kappa[:, 1:], theta)
+    between = 0.5 * (kappa[1:] + kappa[:-1])
+    np.testing.assert_allclose(
+        curve.sensitivities(between), alone.sensitivities(between[:, 1:])
+    )

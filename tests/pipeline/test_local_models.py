@@ -89,7 +89,7 @@ def error_at_order_two(records, truth, **options):
 
 
 @pytest.mark.parametrize(
-    "seeds", [(13,), pytest.param((11, 12, 13), marks=pytest.mark.slow)]
+    "seeds", [(11,), pytest.param((22, 24, 25), marks=pytest.mark.slow)]
 )
 def test_a_load_has_states_of_its_own_beside_those_of_a_structure(seeds):
     errors = []

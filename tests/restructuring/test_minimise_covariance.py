@@ -284,6 +284,24 @@ def test_a_fit_that_noise_does_not_explain_begins_at_other_starts_too():
     np.testing.assert_allclose(found.theta, theta, rtol=1e-6)
 
 
+def test_what_is_astray_is_not_taken():
+    """As where an uncertainty cannot be the black box's: the start stays."""
+    theta, start = np.array([2.0, 3.0]), np.array([2.2, 2.9])
+    model = LAG.model(theta)
+    pairs = pairs_around(model, random_changes(model))
+    poor = LAG.fix({"b": 2.0})  # which no noise explains
+    found = [
+        efficient_parameters(poor, [(model, pairs)], start[:1], astray=astray)
+        for astray in (None, lambda _: False, lambda _: True)
+    ]
+    assert not found[0].is_plausible
+    np.testing.assert_array_equal(found[0].theta, found[1].theta)
+    np.testing.assert_array_equal(found[2].theta, start[:1])
+    assert found[2].converged and found[2].covariance[0, 0] > 0.0
+    true = efficient_parameters(LAG, [(model, pairs)], start, astray=lambda _: True)
+    np.testing.assert_allclose(true.theta, theta)  # which noise explains
+
+
 def test_nothing_is_weighed_where_no_uncertainty_is_left():
     box = StateSpace([[-2.0]], [[3.0]], [[1.0]])
     omega = np.geomspace(0.1, 10, 5)
