@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -58,6 +58,14 @@ _JOINT = 1e-3  # least singular value, in the range of the points, of ones on no
 _FAR_LESS = 1e-3  # share of the errors below which a parameter says no more
 # Mean squared error, in the spread, of what must not be met worse; but for this share.
 _FORESEEN, _FEW = 0.02, 0.1
+
+
+class _Choice(NamedTuple):
+    """One of several forms."""
+
+    place: int | None  # None where none is plausible
+    proven: bool  # or it must foresee points left out
+    cost: Array  # the criterion of all forms
 
 
 class AutoLPV(Interpolator):
@@ -151,42 +159,37 @@ class AutoLPV(Interpolator):
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         found: list[tuple[str, Any]] = []
+        known = points.whitening is not None
         for fewer in (False, True):
-            for name, form in (
-                _forms(kappa, fewer) if points.whitening is not None else ()
-            ):
+            for name, form in _forms(kappa, fewer) if known else ():
                 form.fit(kappa, points.theta, points.root**2, points.covariance)
                 saturated = form.degrees_of_freedom_ <= 0  # it meets any points
                 if isinstance(form, PolynomialLPV) or not saturated:
                     found.append((name, form))
-            chosen, supported, proven, cost = self._best(found, kappa, points)
+            place, proven, cost = self._most_supported(found, kappa, points)
             if proven:
                 break
         if not proven:
             name, curve = _interpolation(kappa, points)
-            if supported:
-                proven = _foresees(found[chosen][1], curve, kappa, points)
-        chi2 = np.array([form.chi2_ for _, form in found])
-        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
-        if not proven:
-            chosen = len(found)
-            found.append((name, curve.fit(kappa, points.theta, points.root**2)))
-            chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
-        self.form_, self.best_estimator_ = found[chosen]
+            if place is None or not _foresees(found[place][1], curve, kappa, points):
+                place, cost = len(found), np.append(cost, np.nan)
+                found.append((name, curve.fit(kappa, points.theta, points.root**2)))
+        assert place is not None
+        self.form_, self.best_estimator_ = found[place]
         self.selection_ = pd.DataFrame(
             {
                 "form": [name for name, _ in found],
-                "chi2": chi2,
-                "dof": dof,
+                "chi2": [getattr(form, "chi2_", np.nan) for _, form in found],
+                "dof": [getattr(form, "degrees_of_freedom_", 0) for _, form in found],
                 self.criterion: cost,
-                "chosen": np.arange(len(found)) == chosen,
+                "chosen": np.arange(len(found)) == place,
             }
         )
 
-    def _best(
+    def _most_supported(
         self, found: Sequence[tuple[str, Any]], kappa: Array, points: WeightedPoints
-    ) -> tuple[int, bool, bool, Array]:
-        """The form with most support, if any has; if that is proof; what all cost."""
+    ) -> _Choice:
+        """What the covariances speak for."""
         chi2 = np.array([form.chi2_ for _, form in found])
         dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
         good = np.array([form.weighted_ for _, form in found], dtype=bool)
@@ -197,7 +200,7 @@ class AutoLPV(Interpolator):
         price = 2.0 if self.criterion == "aic" else math.log(n)
         cost = chi2 / excess + price * (n - dof)
         if not good.any():
-            return 0, False, False, cost
+            return _Choice(None, False, cost)
         near = good & (cost <= cost[good].min() + _SUPPORT)
         supported = np.flatnonzero(near).tolist()
         # few points tell a parabola from a pole poorly: then it is the parabola
@@ -211,10 +214,10 @@ class AutoLPV(Interpolator):
                 k for k in supported if _has_shown_pole(found[k], found, kappa, points)
             ]
             if poles:
-                return min(poles, key=lambda k: cost[k]), True, True, cost
+                return _Choice(min(poles, key=lambda k: cost[k]), True, cost)
         free = bent[chosen] and n - dof[chosen] > _FREE * n
         surface = meets_any and np.count_nonzero(np.ptp(followed, axis=0)) > 1
-        return chosen, True, not (free or surface), cost
+        return _Choice(chosen, not (free or surface), cost)
 
     def replaced(self, name: str, form: Interpolator) -> AutoLPV:
         """A copy that takes another form, on other evidence than the points'."""

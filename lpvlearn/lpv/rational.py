@@ -152,10 +152,8 @@ class RationalLPV(Interpolator):
                 break
         phi = self._terms(kappa, self.powers_)
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
-        limits = list(self._limits(kappa))
-        limits = limits if psi.shape[1] else limits[:1]  # for no denominator
         alike, plausible, explained = points.unweighted(), None, False
-        for limit in limits:
+        for limit in self._limits(kappa):
             found = fit_rational(phi, psi, limit, points)
             values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
             at = values, found.rank * q + psi.shape[1]
@@ -170,7 +168,7 @@ class RationalLPV(Interpolator):
             found, at = plausible
             self._judge(points, *at)
         elif not explained:
-            found = fit_rational(phi, psi, limits[0], alike)
+            found = fit_rational(phi, psi, next(self._limits(kappa)), alike)
         self.numerator_, self.rank_ = found.numerator, found.rank
         self.denominator_ = np.concatenate([[1.0], found.denominator])
 

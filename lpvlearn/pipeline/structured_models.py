@@ -283,9 +283,9 @@ def _delayed(
 
 def over_points(interpolator: Any, found: StructuredModels) -> Any:
     """The interpolator, fitted to parameters, and by their covariances if it may."""
-    known: Any = found.interpolator
-    if known is not None and known.get_params() == interpolator.get_params():
-        return known
+    fitted = found.interpolator
+    if fitted is not None and fitted.get_params() == interpolator.get_params():
+        return fitted
     known = {}
     if takes_covariance(interpolator):
         known["covariance"] = found.covariance

@@ -86,8 +86,8 @@ def find_bend(evidence: Evidence) -> Bend | None:
     """The first output whose errors clearly are bent, and not just by a little.
 
     By powers of signals, by what these lose in play, or by large changes of the inputs,
-    whichever explains most. Errors of a model that is
-    unstable may be anything, and are not looked at.
+    whichever explains most. Errors of a model that is unstable may be anything, and are
+    not looked at.
     """
     poles = np.linalg.eigvals(evidence.model.A).astype(complex)
     if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:

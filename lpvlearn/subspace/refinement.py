@@ -111,7 +111,8 @@ def refine_simulation(
             return model
         trial, better = improved
         gain = model.loss - better.loss
-        damping = _next_damping(trial.damping, gain / trial.promised)
+        if patient:
+            damping = _next_damping(trial.damping, gain / trial.promised)
         miss = predicted - gain
         model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
