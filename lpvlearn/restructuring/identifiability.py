@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from ..systems.least_squares import column_scale
+from ..systems.least_squares import column_scale, thin_svd
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -137,7 +137,7 @@ def _scaled_svd(J: Complex) -> tuple[Array, Array, Array]:
     # rows of zeros: few frequencies must not hide undetermined combinations
     columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
     unit = column_scale(columns)
-    _, s, Vt = np.linalg.svd(columns / unit, full_matrices=False)
+    _, s, Vt = thin_svd(columns / unit)
     return unit, s, Vt
 
 

@@ -39,7 +39,7 @@ from scipy.stats import chi2
 
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..systems.least_squares import levenberg_marquardt
+from ..systems.least_squares import levenberg_marquardt, thin_svd
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Structure, Target, remembering
 from .known_poles import divide
@@ -129,7 +129,7 @@ def uncertain_response(
         return None
     std = np.maximum(std, floor)
     std = np.where(std > 0, std, 1.0)  # a channel without any gain
-    U, s, _ = np.linalg.svd(V / std[:, None], full_matrices=False)
+    U, s, _ = thin_svd(V / std[:, None])
     kept = s > _FAINT * s[0]
     return UncertainResponse(omega, G, (U[:, kept] / s[kept]).T / std)
 

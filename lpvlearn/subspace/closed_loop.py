@@ -64,7 +64,7 @@ from ..models.innovation import (
     prediction_responses,
 )
 from ..systems.innovations import kalman_filter
-from ..systems.least_squares import scaled_lstsq
+from ..systems.least_squares import scaled_lstsq, thin_svd
 from ..systems.modes import spectral_radius
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .criterion import PRICE
@@ -637,9 +637,7 @@ def _predictor_subspace(
     shifted = np.zeros((past * ny, past * c))
     for i in range(past):
         shifted[i * ny : (i + 1) * ny, i * c :] = weighted[:, : (past - i) * c]
-    left, s, _ = linalg.svd(
-        shifted @ Z[:, : past * c], full_matrices=False, check_finite=False
-    )
+    left, s, _ = thin_svd(shifted @ Z[:, : past * c])
     values = np.maximum(s, np.finfo(float).eps * s[0]) if s[0] else np.ones_like(s)
     states = (left / np.sqrt(values)).T @ shifted
     return _Subspace(factor, states, s / np.sqrt(n_columns), direct, n_columns, past)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import rank_lstsq, scaled_lstsq
+from ..systems.least_squares import rank_lstsq, scaled_lstsq, thin_svd
 from ..systems.modes import spectral_radius
 from .simulation_fit import Freedom
 
@@ -134,10 +134,7 @@ def _left_singular(
         gram = matrix @ matrix.T
     values, vectors = _of_squares(gram, max_order)
     if vectors is None:
-        try:
-            vectors, values, _ = linalg.svd(matrix, False, check_finite=False)
-        except linalg.LinAlgError:  # of divide and conquer, now and then
-            vectors, values, _ = linalg.svd(matrix, False, lapack_driver="gesvd")
+        vectors, values, _ = thin_svd(matrix)
     return vectors[:, :max_order], values
 
 

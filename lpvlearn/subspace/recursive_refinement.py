@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import column_scale, scaled_lstsq
+from ..systems.least_squares import column_scale, scaled_lstsq, thin_svd
 from ..systems.modes import spectral_radius
 from .realization import observability_matrix
 from .records import Record
@@ -89,7 +89,7 @@ def start_recursion(
         return None
     jacobian = stacked[:, :-1]
     scale = column_scale(jacobian)
-    _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
+    _, s, right = thin_svd(jacobian / scale)
     right = right[s > UNDETERMINED * s.max(initial=0.0)]
     directions = right.T / scale[:, None]
     rows = np.column_stack([jacobian @ directions, stacked[:, -1]])

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..systems.least_squares import column_scale, scaled_lstsq
+from ..systems.least_squares import column_scale, scaled_lstsq, thin_svd
 from .records import Record, output_energy
 from .signals import SharedSignals, block_radius
 from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_model
@@ -168,7 +168,7 @@ def _trial_steps(
             continue
         if parts is None:
             scale = column_scale(jacobian)
-            U, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+            U, s, Vt = thin_svd(jacobian / scale)
             known = s > UNDETERMINED * s[0]
             share = (s[known] / s[0]) ** 2
             parts = Vt[known].T / scale[:, None], (U.T @ residual)[known], s[known]

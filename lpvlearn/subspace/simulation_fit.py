@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import RCOND, column_scale, scaled_lstsq
+from ..systems.least_squares import RCOND, column_scale, scaled_lstsq, thin_svd
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
@@ -371,7 +371,7 @@ def project_out(M: Array, n: int) -> Array:
         return M
     own, rest = M[..., :n], M[..., n:]
     scaled = own / column_scale(own)[..., None, :]
-    left, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    left, s, _ = thin_svd(scaled)
     kept = s > RCOND * s.max(axis=-1, initial=0.0, keepdims=True)
     explained = left * kept[..., None, :]
     return rest - explained @ (explained.swapaxes(-1, -2) @ rest)

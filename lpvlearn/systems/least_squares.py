@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
@@ -61,6 +62,23 @@ def rank_lstsq(M: Array, rhs: Array, rcond: float) -> tuple[Array, int]:
         M, columns, np.zeros(n, np.int32), rcond, n_work
     )
     return solution[:n].reshape(n, *rhs.shape[1:]), int(rank)
+
+
+def thin_svd(M: Array) -> tuple[Array, Array, Array]:
+    """``M = U diag(s) V^T``, as `numpy.linalg.svd` without full matrices.
+
+    Of one matrix or of a stack. By QR iterations where divide and conquer does not
+    converge, as it does not for some matrices of which columns follow from others.
+    """
+    try:
+        U, s, Vt = np.linalg.svd(M, full_matrices=False)
+    except np.linalg.LinAlgError:
+        if M.ndim > 2:
+            parts = zip(*map(thin_svd, M), strict=True)
+            U, s, Vt = (np.array(part) for part in parts)
+        else:
+            U, s, Vt = linalg.svd(M, full_matrices=False, lapack_driver="gesvd")
+    return U, s, Vt
 
 
 def column_scale(M: Array) -> Array:

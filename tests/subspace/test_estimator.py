@@ -184,6 +184,27 @@ def test_automatic_order_on_the_slow_and_fast_system():
     assert np.median(orders) == 6
 
 
+@pytest.mark.slow
+def test_zones_of_a_building_whose_heaters_add_up():
+    """Jacobians of which many columns follow from others, as far as numbers tell."""
+    n, dt, rng = 4, 0.25, np.random.default_rng(300)
+    air = -1.85 * np.eye(n) + 0.3 * np.roll(np.eye(n), 1, axis=1)
+    A = np.block([[air, np.eye(n)], [np.eye(n) / 20, -0.075 * np.eye(n)]])
+    B = np.block([[2.0 * np.eye(n), np.full((n, 1), 0.25)], [np.zeros((n, n + 1))]])
+    B[n:, n] = 1 / 40
+    system = StateSpace(A, B, np.eye(n, 2 * n)).to_discrete(dt)
+    heaters = np.repeat(rng.standard_normal((125, n)) > 0, 8, axis=0)
+    daily = 10 + 6 * np.sin(2 * np.pi * dt * np.arange(1000) / 24)
+    outside = daily + lfilter([0.1], [1, -0.98], rng.standard_normal(1000))
+    u = np.column_stack([heaters, outside])
+    rest = np.linalg.solve(np.eye(2 * n) - system.A, system.B @ u.mean(axis=0))
+    y = system.simulate(u, initial_state=rest)
+    model = SubspaceLTI(sampling_time=dt).fit(
+        u, y + 0.05 * np.random.default_rng(0).standard_normal(y.shape)
+    )
+    assert bft(y, model.predict_with_initial_state(u, y)).min() > 98.0
+
+
 def test_selection_table_shows_what_was_tried(rng):
     u = rng.standard_normal((400, 1))
     y = noisy(lti_response(*(np.array([[v]]) for v in (0.9, 1, 1, 0)), u), 20, rng)

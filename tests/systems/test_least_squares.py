@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lpvlearn.systems.least_squares import levenberg_marquardt
+from lpvlearn.systems.least_squares import levenberg_marquardt, thin_svd
 
 
 def rosenbrock(x, _):
@@ -98,3 +98,19 @@ def test_a_point_whose_squared_derivatives_overflow_is_none():
 
     reached, cost = levenberg_marquardt(residuals, np.array([[2.0]]))
     assert reached.item() == 2.0 and cost.item() == np.inf
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_an_svd_that_does_not_converge_is_found_by_another_way(monkeypatch, stacked):
+    M = np.random.default_rng(0).standard_normal((6, 3))
+    M = np.column_stack([M, M[:, 0] - 2.0 * M[:, 1]])
+    M = np.stack([M, 2.0 * M]) if stacked else M
+
+    def fails(*_, **__):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(np.linalg, "svd", fails)
+    U, s, Vt = thin_svd(M)
+    assert U.shape == M.shape and s.shape == M.shape[:-2] + (4,)
+    np.testing.assert_allclose((U * s[..., None, :]) @ Vt, M, atol=1e-13)
+    np.testing.assert_allclose(s[..., 3], 0.0, atol=1e-13)
