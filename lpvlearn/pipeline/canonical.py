@@ -9,7 +9,8 @@ covariances, and foresee one another by it, happens by no chance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import combinations, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..lpv.weighting import noise_explains
 from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
+from ..systems.least_squares import RCOND, column_scale
 from .black_boxes import of_rates
 from .left_out import (
     UNLIKE,
@@ -50,6 +52,11 @@ _FORESEEN, _BY_NOISE, _MISSED = 0.01, 0.3, 0.05
 # mean, where outputs integrate: a jump of the rate costs more, and stays.
 _JUMP = 0.5
 
+# Bias of parameters, in standard deviations, by which they are all but linear in what
+# noise does to a model; where they are not, choices of states that are tried, and the
+# share of the bias of the usual ones that others must stay below
+_STRAIGHT, _MOST_CHAINS, _FAR_LESS = 0.1, 12, 0.1
+
 
 class CanonicalModels(NamedTuple):
     """Models of all points in the form, and the covariances of their parameters."""
@@ -60,28 +67,83 @@ class CanonicalModels(NamedTuple):
 
 
 def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None:
-    """None where a model has no such form, or its covariance is not known."""
+    """None where a model has no such form, or its covariance is not known.
+
+    Of the outputs and derivatives that may be the states, the usual ones: or others, of
+    which noise bends the parameters (`_bend`) far less.
+    """
     integrating = local[0].integrating
     models = [of_rates(model.lti, integrating) for model in local]
     first = models[0]
     if len({model.order for model in models}) > 1 or not first.order:
         return None
+    around = []
+    for model in local:
+        deviated = [m for pair in model.deviated() for m in pair]
+        if not deviated:
+            return None
+        around.append([of_rates(m, integrating) for m in (model.lti, *deviated)])
     sizes = first.order, first.n_inputs, first.n_outputs
     direct = any(bool(model.D.any()) for model in models)
-    form = CanonicalForm(GrayBoxStructure.observable_canonical(*sizes, direct), None)
-    structure = GrayBoxStructure.observable_canonical(*sizes, direct, integrating)
-    theta, covariance = [], []
-    for model in local:
-        around = [m for pair in model.deviated() for m in pair]
-        rates = [of_rates(m, integrating) for m in (model.lti, *around)]
-        rows = [form.parameters(_matrix(m)) for m in rates]
-        known = [row for row in rows if row is not None]
-        if not around or len(known) < len(rows):
-            return None
-        changes = np.array(known[1::2]) - np.array(known[2::2])
-        theta.append(known[0])
-        covariance.append(changes.T @ changes / (2.0 * DEVIATION) ** 2)
-    return CanonicalModels(structure, np.array(theta), np.array(covariance))
+    best, least = None, np.inf
+    for indices in islice(_indices(*sizes[::2]), _MOST_CHAINS):
+        of_rate, whole = (
+            GrayBoxStructure.observable_canonical(*sizes, direct, some, indices)
+            for some in ((), integrating)
+        )
+        known = _parameters(of_rate, around)
+        if known is None:
+            continue
+        theta, changes, bias = known
+        bend = max(map(_bend, changes, bias))
+        if best is None or bend < least:
+            least = bend if best else _FAR_LESS * bend
+            best = CanonicalModels(whole, theta, changes.mT @ changes)
+        if bend < _STRAIGHT:
+            break
+    return best
+
+
+def _indices(order: int, n_outputs: int) -> Iterator[tuple[int, ...]]:
+    """Lengths of the chains of states that outputs head, the usual ones first.
+
+    They differ by one at most.
+
+    >>> list(_indices(3, 2)), list(_indices(4, 2))
+    ([(2, 1), (1, 2)], [(2, 2)])
+    """
+    each, n_longer = divmod(order, n_outputs)
+    for longer in combinations(range(n_outputs), n_longer):
+        yield tuple(each + (i in longer) for i in range(n_outputs))
+
+
+def _parameters(
+    structure: GrayBoxStructure, around: Sequence[Sequence[StateSpace]]
+) -> tuple[Array, Array, Array] | None:
+    """Parameters of points (n_points, n), their changes, and what noise biases them by.
+
+    Changes (n_points, k, n) with each of what is not known of a model, by its standard
+    deviation. Of groups of a model and the pairs about it; None where one has none.
+    """
+    form = CanonicalForm(structure, None)
+    rows = [[form.parameters(_matrix(m)) for m in group] for group in around]
+    if any(row is None for group in rows for row in group):
+        return None
+    points = np.array(rows)
+    at, up, down = points[:, 0], points[:, 1::2], points[:, 2::2]
+    changes = (up - down) / (2.0 * DEVIATION)
+    bias = 0.5 * (up + down - 2.0 * at[:, None]).sum(axis=1) / DEVIATION**2
+    return at, changes, bias
+
+
+def _bend(changes: Array, bias: Array) -> float:
+    """The bias of parameters that bend with noise, in their standard deviations.
+
+    ``sqrt(b^T P^+ b)``: the shortest step of what is not known that moves them so.
+    """
+    unit = column_scale(changes)
+    step = np.linalg.lstsq((changes / unit).T, bias / unit, rcond=RCOND)[0]
+    return float(np.linalg.norm(step))
 
 
 def is_better_form(

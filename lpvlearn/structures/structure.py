@@ -304,12 +304,13 @@ class GrayBoxStructure(VersionedPickle):
         n_outputs: int = 1,
         feedthrough: bool = False,
         integrating: Sequence[int] = (),
+        indices: Sequence[int] | None = None,
     ) -> GrayBoxStructure:
-        """Observable canonical form with generic observability indices.
+        """Observable canonical form, by default of generic observability indices.
 
         Output ``i`` heads a chain of states, each the derivative of the one before;
-        the last row of a chain and all of B are free. The chains differ in length
-        by one at most. Every generic model of that order has exactly one such form.
+        the last row of a chain and all of B are free. Every generic model of that order
+        has exactly one such form for all lengths of the chains.
 
         Parameters
         ----------
@@ -320,11 +321,15 @@ class GrayBoxStructure(VersionedPickle):
         integrating : sequence of int, default=()
             Places of outputs that are integrals of those of the form, with a state each
             behind the others.
+        indices : sequence of int or None, default=None
+            Length of the chain of every output, which add up to the order. None: they
+            differ by one at most, and those of the first outputs are the longer.
 
         Raises
         ------
         ValueError
-            If a number is not a valid integer, or nothing is free.
+            If a number is not a valid integer, nothing is free, or `indices` do not
+            add up to the order.
 
         Examples
         --------
@@ -336,7 +341,9 @@ class GrayBoxStructure(VersionedPickle):
                [-4., -1.]])
         """
         return cls._integrated(
-            observable_canonical_cells(order, n_inputs, n_outputs, feedthrough),
+            observable_canonical_cells(
+                order, n_inputs, n_outputs, feedthrough, indices
+            ),
             integrating,
         )
 

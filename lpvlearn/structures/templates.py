@@ -285,14 +285,19 @@ class _Parser:
 
 
 def observable_canonical_cells(
-    order: int, n_inputs: int, n_outputs: int, feedthrough: bool
+    order: int,
+    n_inputs: int,
+    n_outputs: int,
+    feedthrough: bool,
+    indices: Sequence[int] | None,
 ) -> SystemCells:
     """A, B, C, D of the form, see `GrayBoxStructure.observable_canonical`."""
     _, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
     A: Cells = [[0.0] * order for _ in range(order)]
     first = 0
-    for i in range(min(order, n_outputs)):  # rows of C beyond the order stay free
-        length = order // n_outputs + (i < order % n_outputs)
+    for i, length in enumerate(_chains(order, n_outputs, indices)):
+        if length == 0:
+            continue  # its row of C stays free
         C[i] = [1.0 if j == first else 0.0 for j in range(order)]
         last = first + length - 1
         for k in range(first, last):
@@ -300,6 +305,21 @@ def observable_canonical_cells(
         A[last] = [f"a{last + 1}_{j + 1}" for j in range(order)]
         first += length
     return A, B, C, D
+
+
+def _chains(order: int, n_outputs: int, indices: Sequence[int] | None) -> list[int]:
+    """Lengths of the chains of states, of every output."""
+    if indices is None:
+        return [order // n_outputs + (i < order % n_outputs) for i in range(n_outputs)]
+    lengths = []
+    if has_one_axis(indices):
+        lengths = [whole_number("indices", length, 0) for length in indices]
+    if len(lengths) != n_outputs or sum(lengths) != order:
+        raise ValueError(
+            f"`indices` must be a list of a number for each of {n_outputs} output(s), "
+            f"which add up to the order, {order}. Got {shown(indices)}."
+        )
+    return lengths
 
 
 def full_cells(

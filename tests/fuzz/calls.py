@@ -240,7 +240,7 @@ def structure_calls(w):
         "order": 2, **sizes, "integrating": [0],
     }  # fmt: skip
     yield "GrayBoxStructure.observable_canonical", make.observable_canonical, {
-        "order": 2, **sizes,
+        "order": 2, **sizes, "indices": [0, 2],
     }  # fmt: skip
     yield "GrayBoxStructure.modal", make.modal, {
         "n_modes": 1, **sizes, "n_real": 1, "normalize": "input",

@@ -220,3 +220,36 @@ def test_a_form_that_misses_its_own_points_is_not_taken(seed):
         warnings.simplefilter("ignore")  # of poles on the negative real axis
         fitted = pipeline().fit(X, y)
     assert fitted.report_["interpolation_error"].max() < 0.3
+
+
+def drivetrain(wind):
+    """A heavy rotor and a light generator on one shaft, and the speeds of both."""
+    drag, torque = 2.0 + 0.25 * wind + 0.02 * wind**2, 5.0 + 1.2 * wind
+    A = [[-(0.3 + drag) / 40, 0.3 / 40, -90 / 40], [0.3, -0.5, 90.0], [1.0, -1.0, 0.0]]
+    B = [[-torque / 40, 0.0], [0.0, -1.0], [0.0, 0.0]]
+    return StateSpace(A, B, np.eye(2, 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_states_are_those_outputs_whose_parameters_noise_does_not_bend(noise):
+    """The speed of the rotor and its derivative hardly tell the states."""
+    step, n, trajectories = 0.05, 1500, []
+    rng = np.random.default_rng(0)
+    for wind in (0.0, 4.0, 8.0, 12.0, 16.0):
+        u = np.repeat(rng.choice([-1.0, 1.0], (n // 8 + 1, 2)), 8, axis=0)[:n]
+        y = drivetrain(wind).simulate(u, sampling_time=step)
+        y = y + noise * y.std(axis=0) * rng.standard_normal(y.shape)
+        trajectories.append((u, wind, y))
+    X, y = from_trajectories(trajectories, sampling_time=step)
+    lpv = pipeline().fit(X, y).lpv_
+    u = np.repeat(rng.choice([-1.0, 1.0], (100, 2)), 8, axis=0)
+    for wind in (2.0, 10.0, 14.0):
+        truth = drivetrain(wind).simulate(u, sampling_time=step)
+        assert bft_score(truth, lpv.at(wind).simulate(u, sampling_time=step)) > 99.0
+    wind, x, truth = np.linspace(0.0, 16.0, 800), np.zeros(3), []
+    for v, value in zip(u, wind, strict=True):
+        frozen = drivetrain(value).to_discrete(step)
+        truth.append(frozen.C @ x)
+        x = frozen.A @ x + frozen.B @ v
+    assert bft_score(np.array(truth), lpv.simulate(u, wind, step)) > 99.0

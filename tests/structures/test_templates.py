@@ -158,14 +158,14 @@ def test_templates_of_order_zero():
 # -- canonical forms -------------------------------------------------------------
 
 
-def canonical_parameters(model, structure):
+def canonical_parameters(model, structure, lengths=None):
     """Parameters of the canonical form of a model, by linear algebra alone.
 
     In the canonical basis the states are rows ``C_i A^k`` of the observability matrix:
     the change of basis is known, and every entry of the form can be read off.
     """
     n, p = model.order, model.n_outputs
-    lengths = [n // p + (i < n % p) for i in range(p)]
+    lengths = lengths or [n // p + (i < n % p) for i in range(p)]
     T = np.array(
         [
             model.C[i] @ np.linalg.matrix_power(model.A, k)
@@ -210,6 +210,27 @@ def test_canonical_form_holds_every_generic_model(
         model.frequency_response(omega),
         atol=1e-9,
     )
+
+
+@pytest.mark.parametrize("indices", [(1, 2), (0, 3), (3, 0)])
+def test_chains_of_a_canonical_form_are_as_long_as_asked(indices):
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(3, 3)) - 2.0 * np.eye(3)
+    model = StateSpace(A, rng.normal(size=(3, 1)), rng.normal(size=(2, 3)))
+    structure = GrayBoxStructure.observable_canonical(3, 1, 2, indices=indices)
+    found = structure.model(canonical_parameters(model, structure, indices)[0])
+    omega = np.array([0.0, 0.4, 3.0])
+    wanted = model.frequency_response(omega)
+    assert_allclose(found.frequency_response(omega), wanted, atol=1e-9)
+    for output, length in enumerate(indices):  # each the derivative of the one before
+        chain = [found.C[output] @ np.linalg.matrix_power(found.A, k) for k in range(3)]
+        assert_array_equal(np.isin(chain[:length], [0.0, 1.0]), True)
+
+
+@pytest.mark.parametrize("indices", [(1, 1), (1, 1, 1), (-1, 4), (1.5, 1.5), 3, "12"])
+def test_chains_that_do_not_add_up_are_refused(indices):
+    with pytest.raises(ValueError, match="`indices` must be"):
+        GrayBoxStructure.observable_canonical(3, 1, 2, indices=indices)
 
 
 @pytest.mark.parametrize("make", ["observable_canonical", "full"])
