@@ -85,8 +85,7 @@ class Limits:
         """
         system, structure = self.system, self.system.structure
         n = system.n
-        A = system.split(structure.system_matrix(theta))[0]
-        poles, V = np.linalg.eig(A)
+        poles, V = np.linalg.eig(system.model(theta).A)
         W = np.linalg.pinv(V)
         dA = structure.jacobian(theta)[:, :n, :n].reshape(len(theta), n * n)
         d = (W[:, :, None] * V.T[:, None]).reshape(n, n * n) @ dA.T  # w_i dA_j v_i

@@ -243,11 +243,11 @@ def _matched_feedthrough(
         return theta, np.ones(len(theta), bool)
     only_D = in_D & ~elsewhere
     theta = theta.copy()
-    error = system.split(structure.system_matrix(theta))[3] - system.target.D
+    error = system.model(theta).D - system.target.D
     if only_D.any():
         columns = S[only_D][:, n:, n:].reshape(int(only_D.sum()), -1).T
         theta[only_D] -= np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
-        error = system.split(structure.system_matrix(theta))[3] - system.target.D
+        error = system.model(theta).D - system.target.D
     size = max(float(np.abs(system.target.D).max()), float(np.abs(error).max()), 1e-300)
     if np.abs(error).max() > _NO_FEEDTHROUGH * size and in_D.any():
         raise ValueError(

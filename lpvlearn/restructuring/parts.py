@@ -74,10 +74,8 @@ def start_by_parts(
             key = (part.offset.tobytes(), part.basis.tobytes(), j)
             if key not in known:
                 rate = float(np.abs(np.linalg.eigvals(mode.A)).max()) or 1.0
-                problem = scaled_problem(
-                    mode.A, mode.B, mode.C, mode.D, part.offset, part.basis,
-                    rate if box.dt is None else 1.0,
-                )  # fmt: skip
+                rate = rate if box.dt is None else 1.0
+                problem = scaled_problem(mode, part.offset, part.basis, rate)
                 known[key] = similarity_starts(problem, _STARTS, rng)
             thetas, costs = known[key]
             if len(thetas):
