@@ -95,8 +95,7 @@ class Quadratic:
     M: Complex
     Z: Complex
     both: Complex  # (Z M + M Z) / 2
-    tau: float  # square of the level
-    by_level: Array  # derivative of the gradient by tau
+    by_level: Array  # derivative of the gradient by the square tau of the level
     level_curvature: float  # second derivative of psi by tau
 
     def corrected(self, bend: Complex) -> Array:
@@ -265,7 +264,7 @@ class Barrier:
         hessian = hessian + geometry.second_derivatives(normal)
         value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
         local = value, gradient, hessian, geometry
-        return Quadratic(mu, *local, E, C, M, Z, both, tau, by_level, level_curvature)
+        return Quadratic(mu, *local, E, C, M, Z, both, by_level, level_curvature)
 
     def _factor(self, C: Complex, gaps: Array, mu: float) -> Complex:
         """F with ``Z = F F^H``: the multipliers carried, within reach of ``mu M``.
