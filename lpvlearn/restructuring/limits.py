@@ -107,6 +107,11 @@ class Limits:
         sizes += [span[low], span[high]]
         return self.values(theta, poles), np.vstack(dc), np.concatenate(sizes)
 
+    def scaled(self, theta: Array, T: Array) -> tuple[Array, Array]:
+        """Constraints relative to their sizes, and gradients in y, ``theta + T y``."""
+        c, dc, size = self.rows(theta)
+        return c / size, dc @ T / size[:, None]
+
     def values(self, theta: Array, poles: Complex) -> Array:
         """The constraints alone, at parameters and poles of their gray-box model."""
         structure = self.system.structure
