@@ -124,7 +124,7 @@ class RestructuringProblem:
 
     def rounding(self, theta: Array) -> float:
         """The relative error that rounding makes of both models."""
-        units = _UNITS * self.system.rounding(theta) / max(self.reference, 1e-300)
+        units = _UNITS * self.system.rounding(theta) / self.reference
         return min(units, _MOST_ROUNDING)
 
     def is_exact(self, fit: LeastSquaresResult, enough: float = EXACT_FIT) -> bool:
