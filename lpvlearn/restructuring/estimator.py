@@ -670,8 +670,31 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        with bounded(self._seconds()):
-            return self._searched(problem, given, estimates, uncertainty, only_given)
+        rule = "be a whole number from 0 to 2**32 - 1, or None"
+        with naming_argument("random_state", rule, self.random_state):
+            seed = check_random_state(self.random_state).randint(2**31)
+        enough = max(EXACT_FIT, _NOISY * uncertainty)
+        seconds = np.inf if self.max_time is None else float(self.max_time)
+        with bounded(seconds):
+            with bounded(_SEARCH_SHARE * seconds):
+                found = starts_of(
+                    problem, self.init, self.n_starts, given, seed, only_given, enough
+                )
+                hurried = time_is_up()
+            problem, fits = found.problem, found.fits
+            errors = [fit.relative_error for fit in fits]
+            self.starts_ = pd.DataFrame({"relative_error": errors})
+            self.fit_error_, self.start_params_ = errors[0], fits[0].x
+            self.params_, result, floor = self._minimise(problem, fits)
+            self._describe(problem, result, floor)
+            if self.norm == "covariance":
+                self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
+            at = ParameterUncertainty(problem, self.params_)
+            self.identifiability_ = at.identifiability()
+            guessed = not isinstance(self.init, str) or only_given
+            doubted = not (guessed or found.certain)
+            self._warn(problem, result, enough, doubted, hurried)
+        return at
 
     def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
         """Where `params_covariance_` is that of a linear model, and it is none."""
@@ -699,41 +722,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if not names:
             return ""
         return f" At their bounds stand {', '.join(names)}: leave them more room."
-
-    def _seconds(self) -> float:
-        """`max_time`, which is checked, as a float; infinity for None."""
-        return np.inf if self.max_time is None else float(self.max_time)
-
-    def _searched(
-        self,
-        problem: RestructuringProblem,
-        given: list[Array],
-        estimates: Sequence[Estimate],
-        uncertainty: float,
-        only_given: bool,
-    ) -> ParameterUncertainty:
-        rule = "be a whole number from 0 to 2**32 - 1, or None"
-        with naming_argument("random_state", rule, self.random_state):
-            seed = check_random_state(self.random_state).randint(2**31)
-        enough = max(EXACT_FIT, _NOISY * uncertainty)
-        with bounded(_SEARCH_SHARE * self._seconds()):
-            found = starts_of(
-                problem, self.init, self.n_starts, given, seed, only_given, enough
-            )
-            hurried = time_is_up()
-        problem, fits = found.problem, found.fits
-        errors = [fit.relative_error for fit in fits]
-        self.starts_ = pd.DataFrame({"relative_error": errors})
-        self.fit_error_, self.start_params_ = errors[0], fits[0].x
-        self.params_, result, floor = self._minimise(problem, fits)
-        self._describe(problem, result, floor)
-        if self.norm == "covariance":
-            self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
-        at = ParameterUncertainty(problem, self.params_)
-        self.identifiability_ = at.identifiability()
-        doubted = isinstance(self.init, str) and not only_given and not found.certain
-        self._warn(problem, result, enough, doubted, hurried)
-        return at
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
