@@ -102,7 +102,8 @@ class Quadratic:
         """The gradient where the squares are off the linear ones by `bend`."""
         W = _hermitian(self.Z @ bend @ self.M)
         gradient = self.gradient + 2.0 * self.geometry.pulled(self.E @ W)
-        return gradient + self._by_level(self._level_bend(bend))
+        level = self._level_bend(bend) / self.level_curvature
+        return gradient + level * self.by_level
 
     def bend(self, d: Array, E: Complex) -> Complex:
         """Change of the squares that is not linear in a step `d` to the errors `E`."""
@@ -119,10 +120,6 @@ class Quadratic:
     def multipliers(self, d: Array, bend: Complex) -> Complex:
         """Those after the step `d`."""
         return self.mu * self.M - _hermitian(self.Z @ self._rise(d, bend) @ self.M)
-
-    def _by_level(self, slope: float) -> Array:
-        """Change of the gradient with a level for which psi has that slope."""
-        return slope / self.level_curvature * self.by_level
 
     def _level_bend(self, bend: Complex) -> float:
         return float(np.vdot(self.both, bend).real)

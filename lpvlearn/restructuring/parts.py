@@ -140,7 +140,9 @@ def _modes(box: Target, sizes: list[int]) -> list[Target] | None:
     chosen = [*upper[:, None], *single[:, None], *double.reshape(-1, 2)]
     chosen.sort(key=lambda own: own[-1])
     groups = [
-        V[:, own].real if poles[own[0]].imag == 0 else _real_pair(V[:, own[0]])
+        V[:, own].real
+        if poles[own[0]].imag == 0
+        else np.hstack([V[:, own].real, V[:, own].imag])
         for own in chosen
     ]
     T = np.hstack(groups)
@@ -152,8 +154,3 @@ def _modes(box: Target, sizes: list[int]) -> list[Target] | None:
         modes.append(Target(A[own, own], B[own], C[:, own], 0.0 * box.D, box.dt))
         first = own.stop
     return modes
-
-
-def _real_pair(v: NDArray[np.complex128]) -> Array:
-    """Real basis of the space of a complex eigenvector and its conjugate."""
-    return np.column_stack([v.real, v.imag])
