@@ -36,7 +36,7 @@ _WINDOWS = 8  # of that length in a record; of a longer transient the start will
 
 
 def score_from_rest(
-    estimator: Any, X: Any, y: Any, sample_weight: ArrayLike | None = None
+    estimator: Any, X: Any, y: Any, sample_weight: ArrayLike | None
 ) -> float:
     """R2 of ``estimator.predict(X)``; tells of motion, and of outputs left out."""
     y = align_outputs(X, y, estimator)

@@ -115,7 +115,7 @@ def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, 
 
 
 def scheduling_labels(
-    estimator: Any, n_scheduling: int, units: Mapping[str, str] | None = None
+    estimator: Any, n_scheduling: int, units: Mapping[str, str] | None
 ) -> list[str]:
     """Labels of a pipeline's scheduling variables, with their units."""
     names = getattr(estimator, "scheduling", None)

@@ -51,7 +51,7 @@ def interpolated_without(
     kappa: Array,
     theta: Array,
     places: Array,
-    covariance: Array | None = None,
+    covariance: Array | None,
 ) -> Array | None:
     """Parameters at places without some points; None where these are needed."""
     keep = ~out

@@ -230,7 +230,7 @@ def refine(
     centre, information = np.zeros(q), np.zeros((q, q))
     if prior is not None:
         centre, information = prior.centre[free], prior.information[np.ix_(free, free)]
-    total = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
+    total = _sizes(records)
     costs: list[tuple[int, float]] = []
     left, told = max_iter, information
 
@@ -241,10 +241,6 @@ def refine(
 
     def all_errors(model: LPVStateSpace, weight: Array) -> list[tuple[Array, Array]]:
         return list(run(later(simulated)(model, r, own, weight) for r in records))
-
-    def remaining(errors: list[tuple[Array, Array]]) -> Array:
-        rms = np.sqrt(np.mean(np.vstack([e for e, _ in errors]) ** 2, axis=0))
-        return np.maximum(rms, _EXACT * np.where(total > 0, total, 1.0))
 
     def gram(c: Array, errors: list[tuple[Array, Array]], weight: Array) -> Array:
         model = model_of(c)
@@ -302,15 +298,14 @@ def refine(
 
     c, known = c0[free], deviation is not None
     if deviation is None:
-        weight = 1.0 / np.where(total > 0, total, 1.0)
-        deviation = remaining(all_errors(start, weight))
+        deviation = _remaining(all_errors(start, 1.0 / total), total)
     for n_round in range(_ROUNDS):
         first, before, weight = n_round == 0, deviation, 1.0 / deviation
         c = minimise(c, weight, n_round, rough=first)
         errors = all_errors(model_of(c), weight)
         if known or left < 1:
             break
-        deviation = remaining(errors)
+        deviation = _remaining(errors, total)
         if not first and np.abs(deviation / before - 1.0).max() <= _SETTLED:
             break
     return Refined(
@@ -323,6 +318,21 @@ def refine(
         costs,
         n_iter=max_iter - left,
     )
+
+
+def _sizes(records: Sequence[Record]) -> Array:
+    """Root mean squares of the outputs, 1 for none."""
+    total = _rms([record.y for record in records])
+    return np.where(total > 0, total, 1.0)
+
+
+def _remaining(found: Sequence[tuple[Array, Array]], sizes: Array) -> Array:
+    """Standard deviations of errors, which are rounding at least."""
+    return np.maximum(_rms([errors for errors, _ in found]), _EXACT * sizes)
+
+
+def _rms(signals: Sequence[Array]) -> Array:
+    return np.asarray(np.sqrt(np.mean(np.vstack(signals) ** 2, axis=0)))
 
 
 def _rotated(G: Array, size: float) -> Array:
@@ -448,9 +458,7 @@ def local_prior(
         constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
         local = replace(model.silenced(), interpolator=constant, bases=())
         found = [simulated(local, record, own) for record in records]
-        rms = np.sqrt(np.mean(np.vstack([e for e, _ in found]) ** 2, axis=0))
-        size = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
-        weight = 1.0 / np.maximum(rms, _EXACT * size)
+        weight = 1.0 / _remaining(found, _sizes(records))
         H = sum(
             _gram(local, record, own, weight, every, *parts)[1:, 1:]
             for record, parts in zip(records, found, strict=True)

@@ -231,7 +231,7 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
     ).set_axis(headings, axis=1)
 
 
-def as_shown(value: Any, style: str = _DIGITS) -> str:
+def as_shown(value: Any, style: str) -> str:
     """A cell of a report as text; nothing for a value that is not known."""
     if isinstance(value, tuple):
         return ", ".join(as_shown(part, style) for part in value)

@@ -328,7 +328,7 @@ class InnovationModel(VersionedPickle):
 
 
 def prediction_responses(
-    A: Array, C: Array, K: Array, n_samples: int, trend: Array | None = None
+    A: Array, C: Array, K: Array, n_samples: int, trend: Array | None
 ) -> Array:
     """As `free_responses`, of the errors of one-step prediction.
 

@@ -203,7 +203,7 @@ def _fit_of(
     model: StateSpace,
     group: Sequence[Experiment],
     sampling_time: float,
-    n_trend: int = 0,
+    n_trend: int,
 ) -> float:
     """BFT (percent, mean over the outputs) of a continuous model on experiments.
 

@@ -238,7 +238,7 @@ def without_structure(
     sampling_time: float,
     interpolator: Any,
     *,
-    every: bool = False,
+    every: bool,
 ) -> list[StructuredModels]:
     """Aligned models and canonical ones, the better first for the `interpolator`.
 

@@ -95,15 +95,15 @@ class Quadratic:
     M: Complex
     Z: Complex
     both: Complex  # (Z M + M Z) / 2
-    tau: float  # square of the level
-    by_level: Array  # derivative of the gradient by tau
+    by_level: Array  # derivative of the gradient by the square tau of the level
     level_curvature: float  # second derivative of psi by tau
 
     def corrected(self, bend: Complex) -> Array:
         """The gradient where the squares are off the linear ones by `bend`."""
         W = _hermitian(self.Z @ bend @ self.M)
         gradient = self.gradient + 2.0 * self.geometry.pulled(self.E @ W)
-        return gradient + self._by_level(self._level_bend(bend))
+        level = self._level_bend(bend) / self.level_curvature
+        return gradient + level * self.by_level
 
     def bend(self, d: Array, E: Complex) -> Complex:
         """Change of the squares that is not linear in a step `d` to the errors `E`."""
@@ -120,10 +120,6 @@ class Quadratic:
     def multipliers(self, d: Array, bend: Complex) -> Complex:
         """Those after the step `d`."""
         return self.mu * self.M - _hermitian(self.Z @ self._rise(d, bend) @ self.M)
-
-    def _by_level(self, slope: float) -> Array:
-        """Change of the gradient with a level for which psi has that slope."""
-        return slope / self.level_curvature * self.by_level
 
     def _level_bend(self, bend: Complex) -> float:
         return float(np.vdot(self.both, bend).real)
@@ -265,7 +261,7 @@ class Barrier:
         hessian = hessian + geometry.second_derivatives(normal)
         value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
         local = value, gradient, hessian, geometry
-        return Quadratic(mu, *local, E, C, M, Z, both, tau, by_level, level_curvature)
+        return Quadratic(mu, *local, E, C, M, Z, both, by_level, level_curvature)
 
     def _factor(self, C: Complex, gaps: Array, mu: float) -> Complex:
         """F with ``Z = F F^H``: the multipliers carried, within reach of ``mu M``.

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models.system_matrix import blocks
 from ..systems.least_squares import levenberg_marquardt
 from ..systems.response import pole_grid, pole_rates, resolvent
 from .deadline import time_is_up
@@ -140,7 +141,7 @@ class _Search:
         theta = self.thetas(X, rows)
         n, q = self.structure.order, theta.shape[1]
         S = self.structure.system_matrix(theta)
-        A, B, C, D = S[:, :n, :n], S[:, :n, n:], S[:, n:, :n], S[:, n:, n:]
+        A, B, C, D = blocks(S, n)
         good = np.asarray(np.isfinite(S).all((1, 2)))
         poles, V = np.linalg.eig(np.where(good[:, None, None], A, 0.0).astype(complex))
         try:

@@ -18,11 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models.system_matrix import blocks
 from ..systems.balancing import balancing_transformation
 from .error_system import ErrorSystem, Target, derivatives
 from .least_squares import fit_frequency_response
 from .limits import Limits, within_bounds
-from .similarity import linear_equations, nearest_parameters, scaled_problem
+from .similarity import (
+    linear_equations,
+    mean_rate,
+    nearest_parameters,
+    scaled_problem,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -222,7 +228,7 @@ class LocalChart:
 
     def __init__(self, S: Array, order: int, dt: float | None, feedthrough: bool):
         n = self.order = order
-        A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+        A, B, C, D = blocks(S, n)
         hankel, left, right = balancing_transformation(A, B, C, discrete=dt is not None)
         if len(left) < n or hankel[-1] <= _MINIMAL * hankel[0]:
             raise ValueError("the model is not minimal, or nearly so.")
@@ -256,11 +262,7 @@ class LocalChart:
 
 
 def _rate(A: Array, dt: float | None) -> float:
-    poles = np.abs(np.linalg.eigvals(A))
-    poles = poles[poles > 0]
-    if dt is not None or poles.size == 0:
-        return 1.0
-    return float(np.exp(np.log(poles).mean()))
+    return 1.0 if dt is not None else mean_rate(np.abs(np.linalg.eigvals(A)))
 
 
 def _without_basis_changes(S: Array, n: int) -> Array:
@@ -268,7 +270,7 @@ def _without_basis_changes(S: Array, n: int) -> Array:
 
     Shape (n (n_inputs + n_outputs), n + n_outputs, n + n_inputs).
     """
-    A, B, C = S[:n, :n], S[:n, n:], S[n:, :n]
+    A, B, C, _ = blocks(S, n)
     orbit = np.zeros((n, n, *S.shape))
     for i in range(n):
         for j in range(n):
@@ -322,10 +324,9 @@ class CanonicalForm:
         distance of `exact`.
         """
         n, structure = self.structure.order, self.structure
-        A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
-        problem = scaled_problem(
-            A, B, C, D, structure.offset, structure.basis, _rate(A, self.dt)
-        )
+        model = Target.of(S, n, self.dt)
+        rate = _rate(model.A, self.dt)
+        problem = scaled_problem(model, structure.offset, structure.basis, rate)
         M, b = linear_equations(problem)
         if len(b) < n * n:
             return None
@@ -360,12 +361,11 @@ class CanonicalForm:
         A realisation of 24 states has lost all but three of the digits, of which the
         form holds seven.
         """
-        theta, n = self.parameters(S, exact), self.structure.order
+        theta = self.parameters(S, exact)
         if theta is None:
             return None
-        model = Target(S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:], self.dt)
         fit = fit_frequency_response(
-            ErrorSystem(self.structure, model),
+            ErrorSystem(self.structure, Target.of(S, self.structure.order, self.dt)),
             theta,
             omega,
             admissible=lambda x: bool(np.isfinite(x).all()),

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..models.system_matrix import blocks
 from ..systems.hinf_norm import PeakSet, linf_norm
 from ..systems.response import pole_grid, pole_rates, resolvent
 
@@ -57,6 +58,16 @@ class Target:
     D: Array
     dt: float | None = None
 
+    @classmethod
+    def of(cls, S: Array, order: int, dt: float | None) -> Target:
+        """The model of a system matrix."""
+        return cls(*blocks(S, order), dt)
+
+    @property
+    def system_matrix(self) -> Array:
+        """``[[A, B], [C, D]]``."""
+        return np.block([[self.A, self.B], [self.C, self.D]])
+
     def repeated(self, copies: int) -> Target:
         """The model side by side, once for every channel: block-diagonal."""
         eye = np.eye(copies)
@@ -76,6 +87,12 @@ def laplace_variable(
         return s, zero + 1j, zero
     z = np.exp(1j * omega * dt)
     return z, 1j * dt * z, -(dt**2) * z
+
+
+def model_response(model: Target, omega: Array) -> Complex:
+    """Frequency response of a model, (k, n_outputs, n_inputs)."""
+    s = laplace_variable(omega, model.dt)[0]
+    return np.asarray(model.C @ resolvent(model.A, s, model.B) + model.D)
 
 
 def model_derivatives(model: Target, omega: Array) -> tuple[Complex, Complex, Complex]:
@@ -254,18 +271,16 @@ class ErrorSystem:
         if weight is not None and weight.D.shape == (1, 1) and self.n_outputs > 1:
             self.weight = weight.repeated(self.n_outputs)
 
-    def split(self, S: Array) -> tuple[Array, Array, Array, Array]:
-        """Blocks ``A, B, C, D`` of a system matrix."""
-        n = self.n
-        return S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+    def model(self, theta: Array) -> Target:
+        """The gray-box model."""
+        return Target.of(self.structure.system_matrix(theta), self.n, self.dt)
 
     def poles(self, theta: Array) -> Complex:
         """Poles of the gray-box model; infinite where its matrices are not finite."""
         S = self.structure.system_matrix(theta)
         if not np.isfinite(S).all():
             return np.full(max(self.n, 1), np.inf + 0j)
-        A = self.split(S)[0]
-        return np.linalg.eigvals(A).astype(complex)
+        return np.linalg.eigvals(S[: self.n, : self.n]).astype(complex)
 
     def resonances(self, poles: Complex) -> Array:
         """Frequencies (rad/s) at which the error may have a narrow peak."""
@@ -297,11 +312,11 @@ class ErrorSystem:
 
     def realisation(self, theta: Array) -> tuple[Array, Array, Array, Array]:
         """Matrices of the error: states of the gray box, the target, the weight."""
-        A, B, C, D = self.split(self.structure.system_matrix(theta))
-        t, n, N = self.target, self.n, self.n + len(self.target.A)
+        g, t, n = self.model(theta), self.target, self.n
+        N = n + len(t.A)
         Ae = np.zeros((N, N))
-        Ae[:n, :n], Ae[n:, n:] = A, t.A
-        parts = Ae, np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
+        Ae[:n, :n], Ae[n:, n:] = g.A, t.A
+        parts = Ae, np.vstack([g.B, t.B]), np.hstack([g.C, -t.C]), g.D - t.D
         return parts if self.weight is None else series(*parts, self.weight)
 
     def restructured(self, structure: Structure) -> ErrorSystem:
@@ -331,25 +346,19 @@ class ErrorSystem:
         known = self.grid[at] == omega
         G = np.empty((len(omega), self.n_outputs, self.n_inputs), complex)
         G[known] = self._target_on_grid[at[known]]
-        G[~known] = self._target_at(omega[~known])
+        G[~known] = model_response(self.target, omega[~known])
         return G
 
     @cached_property
     def _target_on_grid(self) -> Complex:
-        return self._target_at(self.grid)
-
-    def _target_at(self, omega: Array) -> Complex:
-        t, s = self.target, laplace_variable(omega, self.dt)[0]
-        return np.asarray(t.C @ resolvent(t.A, s, t.B) + t.D)
+        return model_response(self.target, self.grid)
 
     def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
         return model_derivatives(self.target, omega)
 
     def response(self, theta: Array, omega: Array) -> Complex:
         """Response of the gray-box model, shape (k, n_outputs, n_inputs)."""
-        A, B, C, D = self.split(self.structure.system_matrix(theta))
-        s = laplace_variable(omega, self.dt)[0]
-        return C @ resolvent(A, s, B) + D
+        return model_response(self.model(theta), omega)
 
     def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
         """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
@@ -358,8 +367,7 @@ class ErrorSystem:
 
     def point(self, theta: Array, omega: Array) -> ResponsePoint:
         """The response, and what its derivatives are made of."""
-        A, B, C, D = self.split(self.structure.system_matrix(theta))
-        return response_point(Target(A, B, C, D, self.dt), omega)
+        return response_point(self.model(theta), omega)
 
     def rounding(self, theta: Array) -> float:
         """The error that a unit in the last place of every entry makes, of both models.
@@ -367,12 +375,10 @@ class ErrorSystem:
         Its largest root mean square over the grid, with units of random signs: no
         parameters are found more exactly.
         """
-        A, B, C, D = self.split(self.structure.system_matrix(theta))
         W = self.weight_response(self.grid)[0]
         squares = np.zeros(len(self.grid))
-        for model in (Target(A, B, C, D, self.dt), self.target):
-            at = response_point(model, self.grid)
-            S = np.block([[model.A, model.B], [model.C, model.D]])
+        for model in (self.model(theta), self.target):
+            at, S = response_point(model, self.grid), model.system_matrix
             squares += np.sum(np.abs(W @ at.L) ** 2 @ S**2 @ np.abs(at.R) ** 2, (1, 2))
         return float(np.finfo(float).eps * np.sqrt(squares.max()))
 

@@ -27,6 +27,7 @@ from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.interchanges import exchangeable, known_before
 from ..structures.structure import GrayBoxStructure
+from ..systems.hinf_norm import PeakSet
 from ..systems.threads import one_blas_thread
 from ..validation import (
     flag,
@@ -489,6 +490,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             Root-mean-square error over frequency, relative to the black box; infinite
             where the parameters give an unstable model.
         """
+        self._check_options()
         problem = self._problem(model)
         fit = problem.fit(problem.structure.check_params(params))
         return np.inf if fit is None else fit.relative_error
@@ -648,7 +650,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self, model: StateSpace | Sequence[StateSpace]
     ) -> RestructuringProblem:
         """What is minimised: the distance of the structure to one or several models."""
-        self._check_options()
         models = list(model) if isinstance(model, Sequence) and model else [model]
         return problem_from_models(
             self.structure, models, self.frequency_weight, self.known_poles
@@ -669,8 +670,31 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        with bounded(self._seconds()):
-            return self._searched(problem, given, estimates, uncertainty, only_given)
+        rule = "be a whole number from 0 to 2**32 - 1, or None"
+        with naming_argument("random_state", rule, self.random_state):
+            seed = check_random_state(self.random_state).randint(2**31)
+        enough = max(EXACT_FIT, _NOISY * uncertainty)
+        seconds = np.inf if self.max_time is None else float(self.max_time)
+        with bounded(seconds):
+            with bounded(_SEARCH_SHARE * seconds):
+                found = starts_of(
+                    problem, self.init, self.n_starts, given, seed, only_given, enough
+                )
+                hurried = time_is_up()
+            problem, fits = found.problem, found.fits
+            errors = [fit.relative_error for fit in fits]
+            self.starts_ = pd.DataFrame({"relative_error": errors})
+            self.fit_error_, self.start_params_ = errors[0], fits[0].x
+            self.params_, result, floor = self._minimise(problem, fits)
+            self._describe(problem, result, floor)
+            if self.norm == "covariance":
+                self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
+            at = ParameterUncertainty(problem, self.params_)
+            self.identifiability_ = at.identifiability()
+            guessed = not isinstance(self.init, str) or only_given
+            doubted = not (guessed or found.certain)
+            self._warn(problem, result, enough, doubted, hurried)
+        return at
 
     def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
         """Where `params_covariance_` is that of a linear model, and it is none."""
@@ -698,41 +722,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if not names:
             return ""
         return f" At their bounds stand {', '.join(names)}: leave them more room."
-
-    def _seconds(self) -> float:
-        """`max_time`, which is checked, as a float; infinity for None."""
-        return np.inf if self.max_time is None else float(self.max_time)
-
-    def _searched(
-        self,
-        problem: RestructuringProblem,
-        given: list[Array],
-        estimates: Sequence[Estimate],
-        uncertainty: float,
-        only_given: bool,
-    ) -> ParameterUncertainty:
-        rule = "be a whole number from 0 to 2**32 - 1, or None"
-        with naming_argument("random_state", rule, self.random_state):
-            seed = check_random_state(self.random_state).randint(2**31)
-        enough = max(EXACT_FIT, _NOISY * uncertainty)
-        with bounded(_SEARCH_SHARE * self._seconds()):
-            found = starts_of(
-                problem, self.init, self.n_starts, given, seed, only_given, enough
-            )
-            hurried = time_is_up()
-        problem, fits = found.problem, found.fits
-        errors = [fit.relative_error for fit in fits]
-        self.starts_ = pd.DataFrame({"relative_error": errors})
-        self.fit_error_, self.start_params_ = errors[0], fits[0].x
-        self.params_, result, floor = self._minimise(problem, fits)
-        self._describe(problem, result, floor)
-        if self.norm == "covariance":
-            self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
-        at = ParameterUncertainty(problem, self.params_)
-        self.identifiability_ = at.identifiability()
-        doubted = isinstance(self.init, str) and not only_given and not found.certain
-        self._warn(problem, result, enough, doubted, hurried)
-        return at
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -765,17 +754,19 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         return theta, result, floor
 
+    def _stand_at(self, problem: RestructuringProblem) -> PeakSet:
+        """The model of `params_` and its errors, whose peaks are returned."""
+        peaks = problem.system.peaks(self.params_)
+        self.lti_, self.error_ = problem.model(self.params_), peaks.norm
+        self.relative_error_ = self.error_ / problem.reference
+        return peaks
+
     def _describe(
         self, problem: RestructuringProblem, result: MinimaxResult, floor: float
     ) -> None:
         """Attributes that describe the result."""
-        system = problem.system
         self.structure_ = problem.whole
-        self.lti_ = problem.model(self.params_)
-        peaks = system.peaks(self.params_)
-        self.error_ = peaks.norm
-        size = problem.reference
-        self.relative_error_ = self.error_ / size if size > 0 else np.nan
+        peaks = self._stand_at(problem)
         self.dropped_feedthrough_ = problem.dropped_feedthrough
         self.structural_floor_ = floor
         self.lower_bound_ = max(floor, problem.lower_bound)
@@ -813,7 +804,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
-        dt, size = problem.system.dt, problem.reference
         admissible = None if problem.division is None else problem.is_stable
         if problem.noise is None:
             found = efficient_parameters(
@@ -821,11 +811,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 estimates,
                 self.params_,
                 others=others,
-                sampling_time=dt,
+                sampling_time=problem.system.dt,
                 admissible=admissible,
                 astray=lambda theta: (
                     problem.system.peaks(theta).norm
-                    > max(_ASTRAY * self.hinf_error_, _FAR * size)
+                    > max(_ASTRAY * self.hinf_error_, _FAR * problem.reference)
                 ),
             )
         else:
@@ -836,9 +826,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if found is None:
             return
         self.params_, self.params_covariance_ = found.theta, found.covariance
-        self.lti_ = problem.model(self.params_)
-        self.error_ = problem.system.peaks(self.params_).norm
-        self.relative_error_ = self.error_ / size if size > 0 else np.nan
+        self._stand_at(problem)
         self.chi2_, self.objective_ = found.cost, np.sqrt(found.cost)
         self.degrees_of_freedom_ = found.degrees_of_freedom
         self.p_value_ = found.p_value
@@ -916,7 +904,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "it. Try another `random_state`, or give `init`.",
                 ConvergenceWarning,
             )
-        floor = self.structural_floor_ / max(problem.reference, 1e-300)
+        floor = self.structural_floor_ / problem.reference
         explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
         error = min(self.fit_error_, self.relative_error_) - floor
         if error > max(_POOR_FIT, enough) and not explained:

@@ -138,10 +138,9 @@ class Division:
             hidden = np.abs(model.C[~step.shown] @ V).max(0, initial=0.0)
             size = np.abs(model.C).max(initial=0.0)
             V = V[:, hidden <= _SHARED * size]
-            S = np.block([[model.A, model.B], [model.C, model.D]])
             left, right, constant = _frame(step, model.C @ V, V, model.B.shape[1])
-            S, n = left @ S @ right + constant, left.shape[0] - len(model.C)
-            model = Target(S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:], model.dt)
+            S = left @ model.system_matrix @ right + constant
+            model = Target.of(S, left.shape[0] - len(model.C), model.dt)
         return model
 
 

@@ -85,8 +85,7 @@ class Limits:
         """
         system, structure = self.system, self.system.structure
         n = system.n
-        A = system.split(structure.system_matrix(theta))[0]
-        poles, V = np.linalg.eig(A)
+        poles, V = np.linalg.eig(system.model(theta).A)
         W = np.linalg.pinv(V)
         dA = structure.jacobian(theta)[:, :n, :n].reshape(len(theta), n * n)
         d = (W[:, :, None] * V.T[:, None]).reshape(n, n * n) @ dA.T  # w_i dA_j v_i
@@ -107,6 +106,11 @@ class Limits:
         dc += [-eye[low], eye[high]]
         sizes += [span[low], span[high]]
         return self.values(theta, poles), np.vstack(dc), np.concatenate(sizes)
+
+    def scaled(self, theta: Array, T: Array) -> tuple[Array, Array]:
+        """Constraints relative to their sizes, and gradients in y, ``theta + T y``."""
+        c, dc, size = self.rows(theta)
+        return c / size, dc @ T / size[:, None]
 
     def values(self, theta: Array, poles: Complex) -> Array:
         """The constraints alone, at parameters and poles of their gray-box model."""

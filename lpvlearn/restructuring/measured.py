@@ -27,7 +27,7 @@ from .error_system import (
     Structure,
     Target,
     laplace_variable,
-    model_derivatives,
+    model_response,
 )
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class MeasuredErrorSystem(ErrorSystem):
 
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""
-        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
+        factor = model_response(weight, self.omega)[:, :1, :1]
         return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
 
     def resonances(self, poles: Complex) -> Array:

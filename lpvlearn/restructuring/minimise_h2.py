@@ -106,14 +106,13 @@ def minimise_h2(
             slope = 0.0
             break
         T = _metric(system, theta, active, negligible)
-        slope = _slope(
-            gradient[active] @ T / J, *_scaled_limits(limits, theta, active, T)
-        )
+        c, dc = limits.scaled(theta, T)
+        slope = shortest_in_hull((gradient @ T / J)[None], dc[c >= _BINDING])[0]
         idle = J >= known * (1.0 - _PROGRESS)
         if slope <= tol or idle or not left or n_iter >= max_iter or time_is_up():
             break
         end, steps = _quasi_newton(
-            system, limits, theta, J, active, T, max_iter - n_iter, history
+            system, limits, theta, J, T, max_iter - n_iter, history
         )
         n_iter += steps
         known, found = J, squared_h2(system, end)
@@ -132,23 +131,16 @@ def minimise_h2(
 def _metric(
     system: ErrorSystem, theta: Array, active: NDArray[np.bool_], negligible: float
 ) -> Array:
-    """Coordinates in which a unit step changes the response by its error."""
+    """Coordinates in which a unit step changes the response by its error.
+
+    Of the `active` parameters: the others stay.
+    """
     E, slopes = system.linearised_error(theta, system.grid)
     size = float(np.linalg.norm(E)) / np.sqrt(len(system.grid))
-    return metric_coordinates(slopes()[..., active], max(size, negligible, 1e-300))
-
-
-def _scaled_limits(
-    limits: Limits, theta: Array, active: NDArray[np.bool_], T: Array
-) -> tuple[Array, Array]:
-    """The limits ``c <= 0`` relative to their sizes, and their gradients in y."""
-    c, dc, size = limits.rows(theta)
-    return c / size, dc[:, active] @ T / size[:, None]
-
-
-def _slope(gradient: Array, c: Array, dc: Array) -> float:
-    """Length of a gradient without what binding limits hold back."""
-    return shortest_in_hull(gradient[None], dc[c >= _BINDING])[0]
+    size = max(size, negligible, 1e-300)
+    T = np.zeros((len(theta), active.sum()), order="F")
+    T[active] = metric_coordinates(slopes()[..., active], size)
+    return T
 
 
 class _TimeIsUp(Exception):
@@ -160,7 +152,6 @@ def _quasi_newton(
     limits: Limits,
     theta: Array,
     J: float,
-    active: NDArray[np.bool_],
     T: Array,
     max_iter: int,
     history: list[dict[str, float]],
@@ -168,9 +159,7 @@ def _quasi_newton(
     """End of a round, and its iterations."""
 
     def theta_of(y: Array) -> Array:
-        end = theta.copy()
-        end[active] += T @ y
-        return end
+        return theta + T @ y
 
     least, best = J, np.zeros(T.shape[1])
 
@@ -185,14 +174,14 @@ def _quasi_newton(
         value, gradient = squared_h2(system, end)
         if value < least:
             least, best = value, y.copy()
-        return value / J, (gradient[active] @ T) / J
+        return value / J, (gradient @ T) / J
 
     @remembering
     def kept(y: Array) -> tuple[Array, Array]:
         end = theta_of(y)
         if not np.isfinite(system.poles(end)).all():
             return np.full(1, -1.0), np.zeros((1, len(y)))
-        return _scaled_limits(limits, end, active, T)
+        return limits.scaled(end, T)
 
     known = len(history)
     try:
@@ -243,11 +232,11 @@ def _matched_feedthrough(
         return theta, np.ones(len(theta), bool)
     only_D = in_D & ~elsewhere
     theta = theta.copy()
-    error = system.split(structure.system_matrix(theta))[3] - system.target.D
+    error = system.model(theta).D - system.target.D
     if only_D.any():
         columns = S[only_D][:, n:, n:].reshape(int(only_D.sum()), -1).T
         theta[only_D] -= np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
-        error = system.split(structure.system_matrix(theta))[3] - system.target.D
+        error = system.model(theta).D - system.target.D
     size = max(float(np.abs(system.target.D).max()), float(np.abs(error).max()), 1e-300)
     if np.abs(error).max() > _NO_FEEDTHROUGH * size and in_D.any():
         raise ValueError(

@@ -180,8 +180,7 @@ class HinfObjective:
     def constraints(self, y: Array) -> tuple[Array, Array]:
         """The limits, relative to their sizes, and the cap, with gradients."""
         theta = self.theta(y)
-        c, dc, size = self.limits.rows(theta)
-        c, dc = c / size, dc @ self.T / size[:, None]
+        c, dc = self.limits.scaled(theta, self.T)
         if self.capped is None or self._cap_frequencies.size == 0:
             return c, dc
         values, slopes = self.capped.gradients(theta, self._cap_frequencies)

@@ -74,10 +74,8 @@ def start_by_parts(
             key = (part.offset.tobytes(), part.basis.tobytes(), j)
             if key not in known:
                 rate = float(np.abs(np.linalg.eigvals(mode.A)).max()) or 1.0
-                problem = scaled_problem(
-                    mode.A, mode.B, mode.C, mode.D, part.offset, part.basis,
-                    rate if box.dt is None else 1.0,
-                )  # fmt: skip
+                rate = rate if box.dt is None else 1.0
+                problem = scaled_problem(mode, part.offset, part.basis, rate)
                 known[key] = similarity_starts(problem, _STARTS, rng)
             thetas, costs = known[key]
             if len(thetas):
@@ -142,7 +140,9 @@ def _modes(box: Target, sizes: list[int]) -> list[Target] | None:
     chosen = [*upper[:, None], *single[:, None], *double.reshape(-1, 2)]
     chosen.sort(key=lambda own: own[-1])
     groups = [
-        V[:, own].real if poles[own[0]].imag == 0 else _real_pair(V[:, own[0]])
+        V[:, own].real
+        if poles[own[0]].imag == 0
+        else np.hstack([V[:, own].real, V[:, own].imag])
         for own in chosen
     ]
     T = np.hstack(groups)
@@ -154,8 +154,3 @@ def _modes(box: Target, sizes: list[int]) -> list[Target] | None:
         modes.append(Target(A[own, own], B[own], C[:, own], 0.0 * box.D, box.dt))
         first = own.stop
     return modes
-
-
-def _real_pair(v: NDArray[np.complex128]) -> Array:
-    """Real basis of the space of a complex eigenvector and its conjugate."""
-    return np.column_stack([v.real, v.imag])

@@ -124,10 +124,10 @@ class RestructuringProblem:
 
     def rounding(self, theta: Array) -> float:
         """The relative error that rounding makes of both models."""
-        units = _UNITS * self.system.rounding(theta) / max(self.reference, 1e-300)
+        units = _UNITS * self.system.rounding(theta) / self.reference
         return min(units, _MOST_ROUNDING)
 
-    def is_exact(self, fit: LeastSquaresResult, enough: float = EXACT_FIT) -> bool:
+    def is_exact(self, fit: LeastSquaresResult, enough: float) -> bool:
         """Whether nothing is better: an error of at most `enough`, or of rounding."""
         error = fit.relative_error
         if not enough < error <= _MOST_ROUNDING:
@@ -453,10 +453,10 @@ def problem_from_response(
     frf: ArrayLike,
     weight: Any,
     sample_weight: ArrayLike | None,
-    noise: ArrayLike | None = None,
-    coherence: ArrayLike | None = None,
-    n_averages: int | None = None,
-    known_poles: ArrayLike | None = None,
+    noise: ArrayLike | None,
+    coherence: ArrayLike | None,
+    n_averages: int | None,
+    known_poles: ArrayLike | None,
 ) -> RestructuringProblem:
     """Match a measured frequency response over its frequencies.
 

@@ -50,8 +50,14 @@ class AffineProblem:
     basis: Array  # (q, n + p, n + m)
 
 
+def mean_rate(rates: Array) -> float:
+    """Geometric mean of the positive ones, 1 where there is none."""
+    rates = rates[rates > 0]
+    return float(np.exp(np.log(rates).mean())) if rates.size else 1.0
+
+
 def scaled_problem(
-    A: Array, B: Array, C: Array, D: Array, offset: Array, basis: Array, rate: float
+    box: Target, offset: Array, basis: Array, rate: float
 ) -> AffineProblem:
     """The problem with time in units of ``1 / rate`` and states rescaled to fit.
 
@@ -59,7 +65,7 @@ def scaled_problem(
     close to one, e.g. the kinematic ones of ``v' = w``: ``s_w = rate s_v``. The
     parameters do not change, only the equations that hold them.
     """
-    n = len(A)
+    n = len(box.A)
     fixed = (offset != 0) & ~(basis != 0).any(0)
     rows, values = [], []
     for i, j in np.argwhere(fixed):
@@ -77,14 +83,14 @@ def scaled_problem(
     s = np.ones(n)
     if rows:
         s = np.exp(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
-    p, m = D.shape
+    p, m = box.D.shape
     left = np.concatenate([1.0 / (s * rate), np.ones(p)])
     right = np.concatenate([s, np.ones(m)])
     return AffineProblem(
-        A / rate,
-        B / rate,
-        C,
-        D,
+        box.A / rate,
+        box.B / rate,
+        box.C,
+        box.D,
         left[:, None] * offset * right,
         left[:, None] * basis * right,
     )
@@ -231,10 +237,10 @@ class _BilinearEquations:
         discrete = box.dt is not None
         self.rate = 1.0 if discrete else max(float(poles.max(initial=0.0)), 1e-300)
         basis = structure.jacobian(theta)
-        problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, self.rate)
+        problem = scaled_problem(box, offset, basis, self.rate)
         self.offset, self.basis = problem.offset, problem.basis
         self.box = Target(problem.A, problem.B, problem.C, problem.D, box.dt)
-        self.S0 = np.block([[problem.A, problem.B], [problem.C, problem.D]])
+        self.S0 = self.box.system_matrix
         self.n, (self.p, self.m) = structure.order, box.D.shape
 
     def start(self, theta: Array) -> Array:

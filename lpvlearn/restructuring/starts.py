@@ -25,12 +25,12 @@ from ..validation import shown
 from .continuation import continued_fits
 from .coordinates import CanonicalForm
 from .deadline import time_is_up
-from .error_system import Target, frequency_grid, model_derivatives
+from .error_system import Target, frequency_grid, model_response
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
 from .parts import start_by_parts
 from .problem import AGREEING, EXACT_FIT, RestructuringProblem, agreeing
-from .similarity import scaled_problem, similarity_starts
+from .similarity import mean_rate, scaled_problem, similarity_starts
 
 Array = NDArray[np.float64]
 
@@ -389,12 +389,6 @@ def _reduced_otherwise(
     return None if theta is None else theta[None]
 
 
-def _mean_rate(rates: Array) -> float:
-    """Geometric mean of the positive ones, 1 where there is none."""
-    rates = rates[rates > 0]
-    return float(np.exp(np.log(rates).mean())) if rates.size else 1.0
-
-
 def _natural_candidates(
     problem: RestructuringProblem,
     equations: ImplicitMap,
@@ -403,7 +397,7 @@ def _natural_candidates(
 ) -> Array:
     """Positive parameters of physical equations of which no size is known."""
     omega, box = problem.omega, problem.box
-    rate = _mean_rate(omega if box is None else np.abs(np.linalg.eigvals(box.A)))
+    rate = mean_rate(omega if box is None else np.abs(np.linalg.eigvals(box.A)))
     # around the rate, up to a factor of e, the states of all equations take part
     near = np.abs(np.log(np.maximum(omega, 1e-300) / rate)) < 1.0
     # of several models the first one
@@ -454,9 +448,9 @@ def _random_similarities(
     sizes = sizes[sizes > _SLOWEST * sizes.max(initial=0.0)]
     scales = [1.0]
     if box.dt is None and sizes.size:
-        scales = [_mean_rate(sizes), float(sizes.max())]
+        scales = [mean_rate(sizes), float(sizes.max())]
     offset, basis = affine.offset, affine.basis
-    scaling = channel_scaling(model_derivatives(box, frequency_grid(poles, box.dt))[0])
+    scaling = channel_scaling(model_response(box, frequency_grid(poles, box.dt)))
     if scaling is not None:  # rank one: factors of the outputs and of the inputs
         outputs, inputs = scaling[:, 0] / scaling[0, 0], scaling[0]
         ones = np.ones(len(box.A))
@@ -467,7 +461,7 @@ def _random_similarities(
         box = Target(box.A, B, C, outputs[:, None] * box.D * inputs, box.dt)
     found = []
     for rate in scales:
-        problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
+        problem = scaled_problem(box, offset, basis, rate)
         found.append(similarity_starts(problem, n_starts, rng)[0])
     return np.vstack(found)
 
@@ -497,7 +491,7 @@ def _padded(
         return box
     rates = growth(np.linalg.eigvals(box.A).astype(complex), box.dt)
     if 0.0 in faint:
-        decay = -_mean_rate(np.abs(rates)) * (_AMONG + np.arange(extra))
+        decay = -mean_rate(np.abs(rates)) * (_AMONG + np.arange(extra))
     else:
         fast = _FAST * float(np.abs(rates).max(initial=0.0)) or 1.0
         decay = -fast * (1.0 + np.arange(extra))
@@ -562,10 +556,8 @@ def _natural_sizes(
     box: Target, affine: AffineMap, order: int, count: int, rng: np.random.Generator
 ) -> Array:
     """Random sizes of parameters that bring all entries of the structure near one."""
-    rate = _mean_rate(np.abs(np.linalg.eigvals(box.A)))
+    rate = mean_rate(np.abs(np.linalg.eigvals(box.A)))
     full = _padded(_reduced(box, order), order, rng, (_FAINT, _FAINT))
-    problem = scaled_problem(
-        full.A, full.B, full.C, full.D, affine.offset, affine.basis, rate
-    )
+    problem = scaled_problem(full, affine.offset, affine.basis, rate)
     size = 1.0 / np.abs(problem.basis).max((1, 2))
     return np.asarray(size * np.exp(rng.normal(size=(count, len(size)))))

@@ -453,7 +453,7 @@ def _fit_together(
     order: int | None,
     n_joint: int,
     settings: Settings,
-    start: tuple[_Innovation, NDArray[np.bool_]] | None = None,
+    start: tuple[_Innovation, NDArray[np.bool_]] | None,
 ) -> _Together:
     """Plant and noise of `n_joint` states or more, told apart.
 

@@ -103,7 +103,7 @@ def with_levels(evidence: Evidence, offsets: Offsets) -> tuple[Evidence, Offsets
     return evidence, offsets
 
 
-def may_have_constants(evidence: Evidence, *, given: bool = False) -> bool:
+def may_have_constants(evidence: Evidence, *, given: bool) -> bool:
     """Whether a model without constants should be tried with them.
 
     They show in its errors, or a slow mode may stand for them; where a channel is far

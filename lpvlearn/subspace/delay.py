@@ -377,7 +377,7 @@ class _Trial:
 
     def loss(self, delay: Delay, size: _Size, j: int) -> float:
         """Mean square of the simulation errors; at least that of rounding."""
-        key = (*delay.tolist(), *size, j)
+        key = (*delay.tolist(), *size, -1 if size.direct else j)
         if key not in self.known:
             mean = float(np.mean(np.concatenate(self.errors(delay, size, j)) ** 2))
             self.known[key] = (mean if np.isfinite(mean) else np.inf) + _ROUNDING

@@ -203,7 +203,7 @@ def _identify_open_loop(
     order: int | None,
     horizon: int | None,
     settings: Settings,
-    like: LocalFit | None = None,
+    like: LocalFit | None,
 ) -> PlantFit:
     """Identify a plant whose inputs do not know the noise, by choice where not given.
 

@@ -199,7 +199,7 @@ def extend_recursion(
     record: Record,
     *,
     starts: bool,
-    point: Realization | None = None,
+    point: Realization | None,
 ) -> tuple[Recursion, StretchError]:
     """Add a stretch of data, linearised at the present model; its own unknowns.
 

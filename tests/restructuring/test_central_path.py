@@ -103,7 +103,8 @@ def test_multipliers_of_their_own_solve_newtons_equations(case):
     assert np.allclose(left, level * both - driven, rtol=1e-6, atol=1e-12)
     # ... which keeps the sum of traces at (1/2 + mu k m) / tau = mu tr M
     total = mu * trace(off.M).sum()
-    assert np.isclose(trace(moved).sum(), total * (1.0 - level / off.tau), rtol=1e-8)
+    tau = level_of(np.linalg.svd(off.E, compute_uv=False).ravel() ** 2, mu)
+    assert np.isclose(trace(moved).sum(), total * (1.0 - level / tau), rtol=1e-8)
     # and squares that bend by what is linear in d add what the Hessian has of first
     # derivatives: its product with d, but for the term of dE^H dE and the second ones
     added = off.corrected(dX) - off.gradient
