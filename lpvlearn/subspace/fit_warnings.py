@@ -91,9 +91,9 @@ def tell_of_still_outputs(outputs: Sequence[Array], telling: Telling) -> None:
         k = int(still[0])
         telling.once(
             "still",
-            f"Output {telling.output(k)} is {outputs[0][0, k]:.6g} in all samples: no "
-            "input acts on it. Check its sensor and its column, or leave it out of "
-            "`y`.",
+            f"Output {telling.output(k)} is {outputs[0][0, k] + 0.0:.6g} in all "
+            "samples: no input acts on it. Check its sensor and its column, or leave "
+            "it out of `y`.",
         )
 
 

@@ -205,6 +205,14 @@ def test_constant_inputs_are_called_by_their_names(rng):
         SubspaceLTI(time=3).fit(X.set_axis([3, 5, 7], axis=1), y)
 
 
+def test_inputs_and_outputs_of_negative_zeros_are_zero(rng):
+    u, y = record(rng, 50)
+    with pytest.raises(ValueError, match="Got input 2 constant at 0:"):
+        SubspaceLTI().fit(np.column_stack([u[:, 0], np.full(50, -0.0)]), y)
+    with pytest.warns(UserWarning, match="Output 2 is 0 in all samples"):
+        SubspaceLTI(2, horizon=5).fit(u, np.column_stack([y[:, 0], np.full(50, -0.0)]))
+
+
 @pytest.mark.parametrize("unit", [1e-290, 1e-308, 1e-310])
 def test_inputs_that_are_next_to_nothing_are_named(unit):
     rng = np.random.default_rng(0)
