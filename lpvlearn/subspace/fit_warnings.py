@@ -456,10 +456,9 @@ def _confirms_means_alone(fitted: LocalFit) -> bool:
 
 def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
     """Tell of outputs that a model of several does not explain."""
-    model, records = fitted.evidence.model, fitted.evidence.records
-    if len(model.C) == 1 or len(model.initial_states) != len(records):
+    model, left = fitted.evidence.model, _motions_left(fitted)
+    if len(model.C) == 1 or left is None:
         return
-    left = motions_left(fitted.evidence)
     poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
     about_one = np.abs(np.linalg.eigvals(model.A) - 1.0) < _ABOUT_ONE
     remedy = "Try"
@@ -473,6 +472,14 @@ def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
             f"{remedy} refine='simulation' or a higher `order`, identify them apart "
             "from the others, or leave them out.",
         )
+
+
+def _motions_left(fitted: LocalFit) -> Array | None:
+    """Part of the motion of every output, NaN of still ones; None where not known."""
+    evidence = fitted.evidence
+    if len(evidence.model.initial_states) != len(evidence.records):
+        return None
+    return motions_left(evidence)
 
 
 def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
@@ -614,6 +621,10 @@ def _warn_of_unknown_response(fitted: LocalFit, telling: Telling) -> None:
     gain = fitted.evidence.static_gain()
     if gain is None:
         return
+    left = _motions_left(fitted) if telling.kinds & {"still", "noisy output"} else None
+    if left is not None:  # what does not answer was told: nobody asks for its response
+        told = ~(left <= USELESS**2)[:, None]
+        gain = gain._replace(size=np.where(told, np.inf, gain.size))
     if gain.unknown.any():
         output, which = np.argwhere(gain.unknown)[0]
         telling.once(

@@ -339,6 +339,22 @@ def test_a_static_gain_that_is_not_known_is_told():
     assert 0 < n_told < 10
 
 
+@pytest.mark.parametrize(
+    "third, match",
+    [
+        pytest.param(lambda e: 0.0 * e + 3.0, "Output 3 is 3", marks=pytest.mark.slow),
+        (lambda e: e, r"of output\(s\) 3"),
+    ],
+)
+def test_nobody_asks_for_the_response_of_an_output_that_does_not_answer(third, match):
+    rng = np.random.default_rng(201)
+    u, y = record(rng, 1_000)
+    y += 0.05 * y.std(axis=0) * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match=match) as told:
+        SubspaceLTI().fit(u, np.column_stack([y, third(rng.standard_normal(len(y)))]))
+    assert len(told) == 1
+
+
 def test_inputs_that_do_not_reach_an_output_need_no_static_gain():
     n_unknown = 0
     for seed in range(6):
