@@ -406,6 +406,11 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
         )
     elif residual > USELESS:
         other = "an `order` of your own" if chose_order else "order='auto'"
+        if len(fitted.model.C) > 1 and fitted.method != "pbsid":
+            other += (
+                ", or method='pbsid' where noise moves the states of the plant, as "
+                "wind and roads do"
+            )
         if not _tells_of_glitches(fitted, telling):  # which hide whatever else there is
             telling.once(
                 "useless",

@@ -355,6 +355,14 @@ def test_nobody_asks_for_the_response_of_an_output_that_does_not_answer(third, m
     assert len(told) == 1
 
 
+@pytest.mark.parametrize("n_outputs", [1, 2])
+def test_a_method_is_named_where_noise_may_move_the_states(rng, n_outputs):
+    u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, n_outputs))
+    with pytest.warns(UserWarning, match="explains next to nothing") as told:
+        SubspaceLTI(2, horizon=5).fit(u, y)
+    assert ("method='pbsid'" in str(told[0].message)) == (n_outputs > 1)
+
+
 def test_inputs_that_do_not_reach_an_output_need_no_static_gain():
     n_unknown = 0
     for seed in range(6):
