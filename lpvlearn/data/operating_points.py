@@ -426,9 +426,9 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
     if n_samples > len(experiments) and constant.any():
         j = int(np.argmax(constant))
         raise ValueError(
-            f"Every output must vary. Got {names[j]!r} constant at {lowest[j]:g}: "
-            "no dynamics can be identified from it. Leave it out of `y`, or check the "
-            "sensor and its column."
+            f"Every output must vary. Got {names[j]!r} constant at "
+            f"{lowest[j] + 0.0:g}: no dynamics can be identified from it. Leave it out "
+            "of `y`, or check the sensor and its column."
         )
 
 

@@ -304,7 +304,7 @@ def check_excitation(pairs: Pairs, called: Callable[[int], str]) -> None:
         k = constant[0]
         raise ValueError(
             f"Every input must vary. Got input {called(k)} "
-            f"constant at {inputs[0][0, k]:g}: "
+            f"constant at {inputs[0][0, k] + 0.0:g}: "
             "its effect cannot be told from the initial state. Excite it, or leave it "
             "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
             "`operating_point=`, `experiment=`)."

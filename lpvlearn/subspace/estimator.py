@@ -473,7 +473,8 @@ class SubspaceLTI(
             on past inputs (beyond chance, and .3 % of the outputs): the model lacks
             states, a delay or a nonlinearity. If squares and cubes of the inputs, or of
             what these do, explain errors of more than 3 % of an output (in open loop,
-            beyond chance): the system is not linear over the range of the record.
+            beyond chance), or measured ones most of what is new in a sample of an
+            unexplained output: the system is not linear over the range of the record.
         """
         self._forget()
         if self.integrating is not None:

@@ -50,6 +50,18 @@ _AT_LIMITS = 0.01  # of the samples, at least, to be told
 
 _SOME = 3  # values that are listed
 
+# What errors follow of a system that is not linear, by its causes
+_FOLLOWED = {
+    "size": "squares or cubes of the inputs or of what these do",
+    "direction": (
+        "the direction in which inputs or outputs move, as friction, backlash and "
+        "hysteresis make them"
+    ),
+    "change": (
+        "large changes of the inputs, as actuators make them whose rate is limited"
+    ),
+}
+
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
 # Share of its fit (one less the relative error) that parts held out must confirm; with
 # 200 samples at equal noise and signal a right model comes to two thirds.
@@ -91,9 +103,9 @@ def tell_of_still_outputs(outputs: Sequence[Array], telling: Telling) -> None:
         k = int(still[0])
         telling.once(
             "still",
-            f"Output {telling.output(k)} is {outputs[0][0, k]:.6g} in all samples: no "
-            "input acts on it. Check its sensor and its column, or leave it out of "
-            "`y`.",
+            f"Output {telling.output(k)} is {outputs[0][0, k] + 0.0:.6g} in all "
+            "samples: no input acts on it. Check its sensor and its column, or leave "
+            "it out of `y`.",
         )
 
 
@@ -329,17 +341,18 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
             RankWarning,
         )
     warn_about_pole(model.A, telling, fitted)
-    _warn_of_error(fitted, chose_order, telling)
+    feedback = fitted.feedback
+    in_loop = feedback is None or feedback.found or "feedback" in telling
+    bent = False
+    if not in_loop and not fitted.stability_loss and not telling.kinds & _BENDS:
+        bent = _warn_of_bends(fitted, telling)
+    _warn_of_error(fitted, chose_order, telling, bent)
     _warn_of_spikes(fitted, telling)
     choice_is_told = TESTS <= telling.kinds or fitted.residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, telling)
-    feedback = fitted.feedback
     if feedback is None or fitted.stability_loss:
         return
-    in_loop = feedback.found or "feedback" in telling
-    if not in_loop and not telling.kinds & _BENDS:
-        _warn_of_bends(fitted, telling)
     if not in_loop and not telling.kinds & (_BENDS | {"useless"}):
         _warn_of_change(fitted, telling)
     if fitted.method == "pbsid" or "lack" in telling:
@@ -382,8 +395,13 @@ def _rounded_output(evidence: Evidence) -> tuple[int, float] | None:
     return output, float(np.sqrt(12.0 * variances[output]) / size)
 
 
-def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> None:
-    """Tell of a model that explains next to nothing, or only without its stability."""
+def _warn_of_error(
+    fitted: LocalFit, chose_order: bool, telling: Telling, bent: bool
+) -> None:
+    """Tell of a model that explains next to nothing, or only without its stability.
+
+    If that is of a plant that is `bent`, it was told.
+    """
     residual, whitening = fitted.residual, fitted.evidence.whitening
     as_found = residual - fitted.stability_loss
     if residual**2 - as_found**2 > _HALF:
@@ -406,13 +424,18 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
         )
     elif residual > USELESS:
         other = "an `order` of your own" if chose_order else "order='auto'"
-        if not _tells_of_glitches(fitted, telling):  # which hide whatever else there is
+        if len(fitted.model.C) > 1 and fitted.method != "pbsid":
+            other += (
+                ", or method='pbsid' where noise moves the states of the plant, as "
+                "wind and roads do"
+            )
+        # Glitches hide whatever else there is.
+        if not bent and not _tells_of_glitches(fitted, telling):
             telling.once(
                 "useless",
-                "The model explains next to nothing of the outputs: its simulation "
-                f"error is {100.0 * residual:.0f} % of their size. Try a longer "
-                f"`horizon` or {other}, and check that inputs and outputs belong "
-                "together and in the order of time.",
+                f"{_next_to_nothing(fitted)} Try a longer `horizon` or {other}, and "
+                "check that inputs and outputs belong together and in the order of "
+                "time.",
             )
     elif follows_means_alone(fitted.evidence) or _confirms_means_alone(fitted):
         higher = "" if chose_order else ", order='auto'"
@@ -424,6 +447,13 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
         )
     elif chose_order and len(fitted.model.A) and not whitening.of_differences:
         _warn_of_outputs(fitted, telling)
+
+
+def _next_to_nothing(fitted: LocalFit) -> str:
+    return (
+        "The model explains next to nothing of the outputs: its simulation error is "
+        f"{100.0 * fitted.residual:.0f} % of their size."
+    )
 
 
 def _tells_of_glitches(fitted: LocalFit, telling: Telling) -> bool:
@@ -456,10 +486,9 @@ def _confirms_means_alone(fitted: LocalFit) -> bool:
 
 def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
     """Tell of outputs that a model of several does not explain."""
-    model, records = fitted.evidence.model, fitted.evidence.records
-    if len(model.C) == 1 or len(model.initial_states) != len(records):
+    model, left = fitted.evidence.model, _motions_left(fitted)
+    if len(model.C) == 1 or left is None:
         return
-    left = motions_left(fitted.evidence)
     poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
     about_one = np.abs(np.linalg.eigvals(model.A) - 1.0) < _ABOUT_ONE
     remedy = "Try"
@@ -473,6 +502,14 @@ def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
             f"{remedy} refine='simulation' or a higher `order`, identify them apart "
             "from the others, or leave them out.",
         )
+
+
+def _motions_left(fitted: LocalFit) -> Array | None:
+    """Part of the motion of every output, NaN of still ones; None where not known."""
+    evidence = fitted.evidence
+    if len(evidence.model.initial_states) != len(evidence.records):
+        return None
+    return motions_left(evidence)
 
 
 def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
@@ -505,18 +542,47 @@ def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
     telling.once("spikes", stands_out)
 
 
-def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
+def _warn_of_bends(fitted: LocalFit, telling: Telling) -> bool:
     """Tell of a plant in open loop that is not linear over the range of the record.
 
-    In a loop, inputs and what they do know the noise.
+    In a loop, inputs and what they do know the noise. Nor are bends looked for beside
+    samples that hide them.
     """
+    poor = fitted.residual > USELESS and not fitted.evidence.whitening.of_differences
+    if poor and _tells_of_glitches(fitted, telling):
+        return False
     bend = find_bend(fitted.evidence)
     if bend is None:
-        return
-    if bend.cause == "direction":
+        return False
+    output, (cause, *others) = telling.output(bend.output), bend.causes
+    what = f"{_next_to_nothing(fitted)} " if poor else ""
+    follow = " or, about as well, ".join(_FOLLOWED[one] for one in bend.causes)
+    if bend.ahead:
+        what = what or f"The model explains little of output {output}. "
         telling.once(
             "bent",
-            f"The errors of output {telling.output(bend.output)} follow the direction "
+            f"{what}What is new in a sample of output {output}, given those before it, "
+            f"follows {follow}, beyond chance and for the most part: over the range of "
+            "this record the system is not linear. Use inputs that move less, about "
+            "one operating point at a time (`split_levels` cuts a record by a signal's "
+            "level), or give what bends it as a scheduling variable.",
+        )
+    elif others:
+        telling.once(
+            "bent",
+            f"{what}The errors of output {output} follow {follow}, beyond chance and "
+            "by more than a little: over the range of this record the system is not "
+            "linear, and the model, which stands in for it there, simulates larger, "
+            "smaller or other motions worse. Compare records of smaller and larger "
+            "motions, which tell size from direction: among small ones stiffening and "
+            "limits are gone, friction and backlash are most of it. Use inputs that "
+            "keep to where the system is linear. Where inputs were measured with "
+            "noise, which looks the same, give what was commanded.",
+        )
+    elif cause == "direction":
+        telling.once(
+            "bent",
+            f"{what}The errors of output {output} follow the direction "
             "in which the inputs or outputs move, beyond chance and by more than a "
             "little, as friction and backlash make them: the model, which stands in "
             "for the system over motions like those of this record, simulates smaller "
@@ -525,10 +591,10 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
             "the play and give that as the input. Where inputs were measured with "
             "noise, which looks the same, give what was commanded.",
         )
-    elif bend.cause == "change":
+    elif cause == "change":
         telling.once(
             "bent",
-            f"The errors of output {telling.output(bend.output)} follow large changes "
+            f"{what}The errors of output {output} follow large changes "
             "of the inputs more than in proportion, beyond chance and by more than a "
             "little, as an actuator makes them whose rate is limited (slew rate): the "
             "model, which stands in for the system over changes like those of this "
@@ -540,7 +606,7 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
     else:
         telling.once(
             "bent",
-            f"The errors of output {telling.output(bend.output)} follow squares or "
+            f"{what}The errors of output {output} follow squares or "
             "cubes of the inputs or of what these do, beyond chance and by more than a "
             "little: over the range of this record the system is not linear, and the "
             "model, which stands in for it there, simulates larger, smaller or other "
@@ -549,6 +615,7 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
             "bends it as a scheduling variable. Where inputs were measured with noise, "
             "which looks the same, give what was commanded.",
         )
+    return True
 
 
 def _warn_of_change(fitted: LocalFit, telling: Telling) -> None:
@@ -614,6 +681,10 @@ def _warn_of_unknown_response(fitted: LocalFit, telling: Telling) -> None:
     gain = fitted.evidence.static_gain()
     if gain is None:
         return
+    left = _motions_left(fitted) if telling.kinds & {"still", "noisy output"} else None
+    if left is not None:  # what does not answer was told: nobody asks for its response
+        told = ~(left <= USELESS**2)[:, None]
+        gain = gain._replace(size=np.where(told, np.inf, gain.size))
     if gain.unknown.any():
         output, which = np.argwhere(gain.unknown)[0]
         telling.once(

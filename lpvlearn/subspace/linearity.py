@@ -10,6 +10,11 @@ misses the area ``h |h| / (2 R)``, which grows with h more than in proportion. W
 lagged inputs explain, and the signals themselves, is taken from all of them before:
 states that a model lacks are another thing. So is what initial states and trends do:
 where little is left of slow noise, much of that is of the first samples.
+
+What a model simulates that explains little of a record tells nothing of how the plant
+moves. There the same is asked of the outputs themselves, a sample ahead: given past
+inputs and outputs, what is new in a linear system depends on no power of them if its
+noise is Gaussian, and on other noise by a small part.
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ from ..systems.simulation import (
 )
 from ..systems.threads import one_blas_thread
 from .noise import through_filter
-from .records import thinned
+from .records import Record, thinned
 from .residuals import (
     BEYOND_CHANCE,
     DEPENDENT,
@@ -41,7 +46,7 @@ from .residuals import (
     whitening_filters,
     without,
 )
-from .simulation_fit import simulation_errors, with_initial_states
+from .simulation_fit import Realization, simulation_errors, with_initial_states
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -60,17 +65,35 @@ _CHANGES = (1, 4, 16)
 # Of the errors as they are, not filtered, large changes must explain that share, which
 # is no chance of slow noise: limits of rate explain 0.45 to 0.95 in the other half of a
 # record; noise that grows with the output, or in a loop that nobody found, less than
-# 0.3.
+# 0.3. Where other causes do, that is what they explain of an output.
 _CLEARLY = 0.4
 
+_ROUNDING = 1e-6  # motion of outputs of unit size that is none, and errors ahead
+
 _CAUSES = ("size", "direction", "change")
+
+# A cause that explains this part of what the first one does may be it as well: cubes of
+# a resonant motion come to 0.45 of one at most, hysteresis has both.
+_AS_WELL = 0.5
+
+# Part of the motion of an output that a model leaves of which no answer tells how the
+# plant moves; and samples before, whose powers may tell the next one.
+_POOR, _BEFORE = 0.5, 3
+
+# Parts of a record, each of which the others explain. The powers of measured outputs
+# must explain the share `_CLEARLY`: stiffening springs come to 0.5 and more, noise that
+# is not Gaussian, and behind zeros outside the unit circle, to 0.2.
+_HALVES, _QUARTERS = 2, 4
 
 
 class Bend(NamedTuple):
     """An output whose errors follow what no linear system does."""
 
     output: int
-    cause: str  # size, direction of motion (friction, backlash), or change of inputs
+    # Size, direction of motion (friction, backlash), or change of inputs: the first of
+    # those that explain most, and others that explain about as much.
+    causes: tuple[str, ...]
+    ahead: bool = False  # of a sample ahead of measured ones, not of the simulation
 
 
 class _Terms(NamedTuple):
@@ -86,30 +109,43 @@ def find_bend(evidence: Evidence) -> Bend | None:
     """The first output whose errors clearly are bent, and not just by a little.
 
     By powers of signals, by what these lose in play, or by large changes of the inputs,
-    whichever explains most. Errors of a model that is unstable may be anything, and are
-    not looked at.
+    whichever explains most. Outputs that are left unexplained are asked themselves
+    first. Errors of a model that is unstable may be anything, and are not looked at.
     """
-    poles = np.linalg.eigvals(evidence.model.A).astype(complex)
-    if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
-        return None
-    poles = poles[poles.imag >= 0.0]
-    poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
-    records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
+    records = thinned(evidence.records, _BENT_SAMPLES)
     records = [record for record in records if record.n_samples > 2 * N_LAGS]
     if not records:
         return None
     model = with_initial_states(
-        evidence.model, records, free, evidence.whitening.weight
+        evidence.model, records, evidence.free, evidence.whitening.weight
     )
-    A, B, C, D = model.A, model.B, model.C, model.D
-    inputs, rest = [record.u.T for record in records], np.zeros(len(A))
     with np.errstate(over="ignore", invalid="ignore"):
         errors = simulation_errors(model, records)
+    bend = _bend_ahead(records, errors)
+    finite = np.isfinite(model.loss) and all(np.isfinite(e).all() for e in errors)
+    if bend is not None or not finite:
+        return bend
+    return _bend_of_simulation(model, records, errors)
+
+
+def _bend_of_simulation(
+    model: Realization, records: Sequence[Record], errors: Sequence[Array]
+) -> Bend | None:
+    """What signals that the inputs give tell of the errors of simulation."""
+    A, B, C, D = model.A, model.B, model.C, model.D
+    poles = np.linalg.eigvals(A).astype(complex)
+    if np.abs(poles).max(initial=0.0) > 1.0:
+        return None
+    poles = poles[poles.imag >= 0.0]
+    poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
+    inputs, rest = [record.u.T for record in records], np.zeros(len(A))
+    with np.errstate(over="ignore", invalid="ignore"):
         moved = [np.hstack([u, lti_response(A, B, C, D, u, rest)]) for u in inputs]
     whole = np.vstack(moved)
-    if not all(np.isfinite(x).all() for x in (whole, *errors)):
+    if not np.isfinite(whole).all():
         return None
-    least = _BENT * np.hstack([record.y for record in records]).std(axis=1)
+    sizes = np.hstack([record.y for record in records]).std(axis=1)
+    least = np.where(sizes > _ROUNDING, _BENT * sizes, np.inf)  # nothing of still ones
     large = np.flatnonzero(np.vstack(errors).std(axis=0) > least).tolist()
     if not large:
         return None
@@ -135,9 +171,43 @@ def find_bend(evidence: Evidence) -> Bend | None:
         )
     errors = [e[n_lags:] for e in errors]
     for i in large:
-        cause = _bend(terms, [e[:, i] for e in errors], i, least[i])
-        if cause is not None:
-            return Bend(i, cause)
+        causes = _causes(terms, [e[:, i] for e in errors], i, least[i])
+        if causes:
+            return Bend(i, causes)
+    return None
+
+
+def _bend_ahead(records: Sequence[Record], errors: Sequence[Array]) -> Bend | None:
+    """What measured signals tell of the next sample, of outputs left unexplained."""
+    m, ny = len(records[0].u), len(records[0].y)
+    whole = np.hstack([np.vstack((record.u, record.y)) for record in records])
+    centre, spread = whole.mean(axis=1), whole.std(axis=1)
+    little = np.vstack(errors).std(axis=0) <= _POOR * spread[m:]
+    poor = np.flatnonzero(~little & (spread[m:] > _ROUNDING)).tolist()
+    if not poor or any(record.missing.any() for record in records):
+        return None
+    spread = np.where(spread > 0.0, spread, 1.0)
+    n_lags = min(N_LAGS, whole.shape[1] // (WINDOWS_PER_LAG * (m + ny)))
+    if n_lags < _BEFORE:
+        return None
+    terms, outputs, near_lags = [], [], range(1, _BEFORE + 1)
+    for record in records:
+        z = (np.vstack((record.u, record.y)).T - centre) / spread
+        past = [delayed(z, np.full(m + ny, k)) for k in range(1, n_lags + 1)]
+        near = np.hstack([z[:, :m], *past[:_BEFORE]])
+        lost = np.hstack([z - _play(z, radius) for radius in _PLAY])
+        bent = [
+            np.hstack([near**power for power in _POWERS]),
+            np.hstack([delayed(lost, np.full(lost.shape[1], k)) for k in near_lags]),
+        ]
+        own = np.broadcast_to(trend_signals(len(z), 2).T[:, None], (len(z), ny, 2))
+        linear = np.hstack([z[:, :m], *past])
+        terms.append(_Terms(own[n_lags:], linear[n_lags:], [b[n_lags:] for b in bent]))
+        outputs.append(z[n_lags:, m:])
+    for i in poor:
+        causes = _causes(terms, [y[:, i] for y in outputs], i, _ROUNDING, ahead=True)
+        if causes:
+            return Bend(i, causes, ahead=True)
     return None
 
 
@@ -163,10 +233,18 @@ def _play(signals: Array, radius: float) -> Array:
     return follow
 
 
-def _bend(
-    terms: Sequence[_Terms], errors: Sequence[Array], output: int, least: float
-) -> str | None:
-    """The cause that explains most of an output, where that is more than `least`."""
+def _causes(
+    terms: Sequence[_Terms],
+    errors: Sequence[Array],
+    output: int,
+    least: float,
+    *,
+    ahead: bool = False,
+) -> tuple[str, ...]:
+    """Causes that explain most of an output, where that is more than `least`.
+
+    Of what is new a sample `ahead`, where that is more than a clear share of it.
+    """
     n_linear, n_own = terms[0].linear.shape[1], terms[0].own.shape[2]
     sizes = [x.shape[1] for x in terms[0].bent]
     signals = [
@@ -176,27 +254,42 @@ def _bend(
     # What is left of the errors is filtered: what the model lacks is no noise.
     columns = _rows(signals, np.ones(1), n_own)
     if len(columns) < _ROWS_PER_TERM * (n_linear + max(sizes) + 1):
-        return None
+        return ()
     plain = without(of_size_one(columns[:, :n_linear]), columns[:, n_linear:])[0]
     noise = plain[:, -1:]
     if not noise.std() > least:
-        return None
+        return ()
     stops = np.cumsum([len(part) for part in signals])[:-1]
     (a,) = whitening_filters(np.split(noise, stops))
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
-    causes: dict[str, float] = {}
+    n_parts = _QUARTERS if ahead else _HALVES
+    found: dict[str, tuple[float, float]] = {}
     stops = np.cumsum([0, *sizes])
-    for cause, first, stop in zip(_CAUSES, stops[:-1], stops[1:], strict=True):
+    for cause, first, stop in zip(_CAUSES, stops[:-1], stops[1:], strict=False):
         which = [*range(first, stop), -1]
         if f_test(left[:, first:stop], left[:, -1], n).p_value < BEYOND_CHANCE:
-            explained = _explained_elsewhere(left[:, which])
-            whole = _explained_elsewhere(plain[:, which])
-            slow = explained > 0.0 and whole > _CLEARLY
-            if slow if cause == "change" else explained * noise.var() > least**2:
-                causes[cause] = whole
-    return max(causes, key=lambda cause: causes[cause], default=None)
+            explained = _explained_elsewhere(left[:, which], n_parts)
+            whole = _explained_elsewhere(plain[:, which], n_parts)
+            clearly = explained > 0.0 and whole > _CLEARLY
+            if ahead:
+                clearly &= explained > _CLEARLY
+            elif cause != "change":
+                share = max(explained, whole) if clearly else explained
+                clearly = share * noise.var() > least**2
+            if clearly:
+                found[cause] = explained, whole
+    if not found:
+        return ()
+    first_cause = max(found, key=lambda cause: found[cause][0])
+    most = found.pop(first_cause)
+    also = [
+        cause
+        for cause, shares in found.items()
+        if all(s > _AS_WELL * m for s, m in zip(shares, most, strict=True))
+    ]
+    return first_cause, *also
 
 
 def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
@@ -209,15 +302,15 @@ def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
     return np.vstack(rows)
 
 
-def _explained_elsewhere(columns: Array) -> float:
-    """Share of the last column that the others explain as they do in its other half.
+def _explained_elsewhere(columns: Array, n_parts: int) -> float:
+    """Share of the last column that the others explain as they do in its other parts.
 
     Noise that grows with the signals, or what changes over the record, may be explained
     beyond the chance of noise that does not, but not by the same terms again.
     """
-    halves = np.array_split(columns, 2)
-    left = 0.0
-    for half, other in zip(halves, halves[::-1], strict=True):
-        fit = scaled_lstsq(other[:, :-1], other[:, -1], DEPENDENT)[0]
-        left += float(np.sum((half[:, -1] - half[:, :-1] @ fit) ** 2))
+    parts, left = np.array_split(columns, n_parts), 0.0
+    for k, part in enumerate(parts):
+        others = np.vstack(parts[:k] + parts[k + 1 :])
+        fit = scaled_lstsq(others[:, :-1], others[:, -1], DEPENDENT)[0]
+        left += float(np.sum((part[:, -1] - part[:, :-1] @ fit) ** 2))
     return 1.0 - left / float(np.sum(columns[:, -1] ** 2))

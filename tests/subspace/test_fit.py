@@ -205,6 +205,14 @@ def test_constant_inputs_are_called_by_their_names(rng):
         SubspaceLTI(time=3).fit(X.set_axis([3, 5, 7], axis=1), y)
 
 
+def test_inputs_and_outputs_of_negative_zeros_are_zero(rng):
+    u, y = record(rng, 50)
+    with pytest.raises(ValueError, match="Got input 2 constant at 0:"):
+        SubspaceLTI().fit(np.column_stack([u[:, 0], np.full(50, -0.0)]), y)
+    with pytest.warns(UserWarning, match="Output 2 is 0 in all samples"):
+        SubspaceLTI(2, horizon=5).fit(u, np.column_stack([y[:, 0], np.full(50, -0.0)]))
+
+
 @pytest.mark.parametrize("unit", [1e-290, 1e-308, 1e-310])
 def test_inputs_that_are_next_to_nothing_are_named(unit):
     rng = np.random.default_rng(0)
@@ -329,6 +337,30 @@ def test_a_static_gain_that_is_not_known_is_told():
         assert said == unknown
         n_told += said
     assert 0 < n_told < 10
+
+
+@pytest.mark.parametrize(
+    "third, match",
+    [
+        pytest.param(lambda e: 0.0 * e + 3.0, "Output 3 is 3", marks=pytest.mark.slow),
+        (lambda e: e, r"of output\(s\) 3"),
+    ],
+)
+def test_nobody_asks_for_the_response_of_an_output_that_does_not_answer(third, match):
+    rng = np.random.default_rng(201)
+    u, y = record(rng, 1_000)
+    y += 0.05 * y.std(axis=0) * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match=match) as told:
+        SubspaceLTI().fit(u, np.column_stack([y, third(rng.standard_normal(len(y)))]))
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("n_outputs", [1, 2])
+def test_a_method_is_named_where_noise_may_move_the_states(rng, n_outputs):
+    u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, n_outputs))
+    with pytest.warns(UserWarning, match="explains next to nothing") as told:
+        SubspaceLTI(2, horizon=5).fit(u, y)
+    assert ("method='pbsid'" in str(told[0].message)) == (n_outputs > 1)
 
 
 def test_inputs_that_do_not_reach_an_output_need_no_static_gain():

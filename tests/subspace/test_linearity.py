@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.linearity import _large_changes
+from lpvlearn.subspace.linearity import _large_changes, find_bend
 
 from ..conftest import modes
 from .test_residuals import coloured
@@ -97,6 +97,75 @@ def test_of_two_levels_a_limited_rate_is_as_linear_as_any():
     y = system.simulate(at_limited_rate(u[:, 0], 0.1)[:, None])
     y += 0.02 * y.std() * rng.standard_normal(y.shape)
     assert not any("of output 1 follow" in message for message in told_of(u, y))
+
+
+def mass_on_a_spring(force, pushes_back, n_steps=6):
+    """Positions of a mass with a resonance at 0.7 rad, and 3 % of damping."""
+    x, v, omega, places = 0.0, 0.0, 0.706, []
+    for f in force:
+        places.append(x)
+        for _ in range(n_steps):
+            a = omega**2 * (f - pushes_back(x)) - 0.06 * omega * v
+            v += a / n_steps
+            x += v / n_steps
+    return np.array(places)
+
+
+def record_of_a_spring(seed, level, pushes_back):
+    rng = np.random.default_rng(seed)
+    u = level * lfilter(*butter(6, 0.65), rng.standard_normal(1_500))
+    y = mass_on_a_spring(u, pushes_back)
+    return u[:, None], y + 0.005 * y.std() * rng.standard_normal(len(y))
+
+
+def stiffens(x):
+    return x + 3.0 * x**3
+
+
+def has_two_wells(x):
+    return -x + 3.0 * x**3
+
+
+@pytest.mark.parametrize(
+    "pushes_back, level, seed",
+    [(stiffens, 0.5, 0), (stiffens, 1.5, 1), (has_two_wells, 0.3, 0)],
+)
+def test_of_what_no_linear_model_explains_the_bend_is_told(pushes_back, level, seed):
+    u, y = record_of_a_spring(seed, level, pushes_back)
+    with pytest.warns(UserWarning, match="explains .* cubes .* is not linear"):
+        SubspaceLTI().fit(u, y)
+
+
+@pytest.mark.parametrize("level, seed", [(0.015, 0), (0.05, 1), (0.1, 3)])
+def test_a_spring_that_stiffens_is_not_taken_for_friction(level, seed):
+    with pytest.warns(UserWarning, match="follows? squares or cubes"):
+        SubspaceLTI(2).fit(*record_of_a_spring(seed, level, stiffens))
+
+
+def test_hysteresis_may_be_by_size_or_direction():
+    rng = np.random.default_rng(0)
+    u, x, v, z, y = 0.5 * rng.standard_normal(2_000), 0.0, 0.0, 0.0, []
+    u = lfilter(*butter(4, 0.2), 3.0 * u)
+    for f in u:
+        y.append(x)
+        for _ in range(20):  # Bouc and Wen
+            v += 0.02 * (f - x - 0.1 * v - z)
+            x += 0.02 * v
+            z += 0.02 * (v - 0.8 * abs(v) * z - 0.2 * v * abs(z))
+    y = np.array(y) + 0.003 * np.std(y) * rng.standard_normal(len(y))
+    with pytest.warns(UserWarning, match="or, about as well"):
+        SubspaceLTI(3).fit(u[:, None], y)
+
+
+@pytest.mark.filterwarnings("ignore:The model explains next to nothing")
+def test_noise_that_is_not_gaussian_bends_no_linear_system():
+    """Behind a zero outside the unit circle its powers tell of what comes."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u, e = rng.standard_normal((1_000, 1)), rng.exponential(size=(1_000, 1)) - 1.0
+        e = lfilter([-0.6, 1.0], [1.0, -0.6], e, axis=0)
+        y = lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0) + e
+        assert find_bend(SubspaceLTI(1, horizon=8).fit(u, y)._evidence) is None
 
 
 @pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
