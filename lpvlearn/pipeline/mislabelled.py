@@ -151,7 +151,7 @@ def _fault(factor: float) -> str:
             "has the reverse sign of what the other points foresee: check its wiring "
             "and its sign there"
         )
-    tens = 10.0 ** np.round(np.log10(size))
+    tens = float(10.0 ** np.round(np.log10(size)))
     size = tens if max(size / tens, tens / size) < _ROUND else float(f"{size:.2g}")
     times = f"{size:.12g} times" if abs(factor) > 1.0 else f"1/{size:.12g} of"
     reverse = "in reverse " if factor < 0.0 else ""
