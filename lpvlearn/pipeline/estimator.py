@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -72,6 +72,7 @@ from .local_models import (
     tell_of_integrators,
 )
 from .memory import checked_memory
+from .mislabelled import tell_of_mislabelled
 from .output_error import (
     best_along,
     known_coefficients,
@@ -558,8 +559,13 @@ list, default=None
             )
             estimator = self._local()
             local, kept = identify(estimator, points, runner)
-            if restructurer in (None, "aligned"):
-                longest = self.sampling_time_ * kept.n_longest
+            longest = self.sampling_time_ * kept.n_longest
+            channels = experiments[0].input_names, self.output_names_
+            wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
+            following = (
+                collected if wrong else nullcontext
+            )  # silent: it follows from that
+            if restructurer in (None, "aligned") and not wrong:
                 quiet = replace(runner, verbose=0)
                 again = partial(identify, points=kept, runner=quiet)
                 order = _foreseen_order(estimator, local, kept, longest, again)
@@ -570,7 +576,7 @@ list, default=None
                 tell_of_integrators(local, self.output_names_, longest)
             points = kept
 
-        with watch.step("restructuring", bar=True):  # step 4
+        with watch.step("restructuring", bar=True), following():  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
             if restructurer is None:
@@ -620,7 +626,7 @@ list, default=None
         steady = begins_held(self.lpv_, found.points, self.sampling_time_)
         self.lpv_ = replace(self.lpv_, steady_start=steady)
 
-        with watch.step("interpolation and report"):
+        with watch.step("interpolation and report"), following():
             self.output_errors_ = (
                 local_output_errors(self.lpv_, found, self.sampling_time_)
                 if self.refiner_ is None

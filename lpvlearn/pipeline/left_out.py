@@ -43,6 +43,10 @@ _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
 _NAMED = 3  # operating points that a message lists
 
+# Of the largest error of the others: the share that is left without a point that is
+# wrong, by what is left without any other one.
+_RELIEF = 0.5
+
 
 def errors_left_out(
     structure: GrayBoxStructure,
@@ -102,10 +106,23 @@ def tell_unforeseen(
             if saturated
             else "no form fits the parameters over the operating points"
         )
+        left = _left_without(lpv.structure, models, form, kappa, theta, forgets)
+        first, second = np.argsort(left)[:2].tolist()
+        named = {k: error for error, k in high or worst}
+        alone = ""
+        if left[first] < min(_RELIEF * left[second], _MEDIAN):
+            named = {first: errors[first]} if first in errors else named
+            alone = (
+                f"Without point {first} (scheduling {label_of(kappa[first])}) the "
+                "others foresee one another within "
+                f"{100.0 * left[first]:.0f} %: check its record and its scheduling "
+                "value. "
+            )
+        worst = [(named[k], k) for k in sorted(named, key=left.__getitem__)]
         warn(
             f"{known}, and the others do not foresee point(s) "
-            f"{listed_errors(high or worst, kappa)}, by the error in the largest gain: "
-            "between points the LPV model may be as wrong. Look at `parameters_` for a "
+            f"{listed_errors(worst, kappa)}, by the error in the largest gain: between "
+            f"points the LPV model may be as wrong. {alone}Look at `parameters_` for a "
             "point that is unlike the others, give a structure where there is none, or "
             "measure in between (`suggest_operating_point`)."
         )
@@ -122,6 +139,27 @@ def tell_unforeseen(
             "largest gain, as wrong as the LPV model may be there. Give a structure "
             "where there is none, or measure in between (`suggest_operating_point`)."
         )
+
+
+def _left_without(
+    structure: GrayBoxStructure,
+    models: Sequence[StateSpace],
+    form: Any,
+    kappa: Array,
+    theta: Array,
+    seen: Callable[[StateSpace], StateSpace],
+) -> list[float]:
+    """Of every point, the largest error of the others that is left without it.
+
+    The least of the one that is wrong: what is beside it is foreseen as badly.
+    """
+    left = []
+    for k in range(len(models)):
+        rest = [i for i in range(len(models)) if i != k]
+        known = [models[i] for i in rest], form, kappa[rest], theta[rest]
+        errors = errors_left_out(structure, *known, seen=seen)
+        left.append(max(errors.values(), default=np.inf))
+    return left
 
 
 def _differences_between(

@@ -202,18 +202,30 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
     theta, covariance = found.theta.copy(), found.covariance.copy()
     models, told, worst = list(found.models), [], 0.0
     names = np.array(found.structure.parameter_names, dtype=object)
+
+    def away(k: int, own: Array, taken: Any) -> tuple[float, Array, StateSpace]:
+        """How far a model of which some values are foreseen is from the record's."""
+        row = np.where(taken, own, found.theta[k])
+        row = np.clip(row, found.structure.lower, found.structure.upper)
+        (model,) = _delayed(found.structure, row[None], [found.local[k]])
+        error = largest_difference(model, found.local[k].lti)
+        return (error if model.is_stable else np.inf), row, model
+
     for k, own in zip(np.flatnonzero(doubtful).tolist(), foreseen, strict=True):
         untold = doubted[k] & (std[k] > scatter)
         if not (untold.any() and ((low <= kappa[k]) & (kappa[k] <= high)).all()):
             continue
         # where one is anything, others may be, with a deviation that is none
         astray = untold | (np.abs(own - theta[k]) > _ASTRAY * scatter)
-        for taken, most in ((astray, _LIKE), (untold, NEAR)):
-            row = np.where(taken, own, theta[k])
-            row = np.clip(row, found.structure.lower, found.structure.upper)
-            (model,) = _delayed(found.structure, row[None], [found.local[k]])
-            error = largest_difference(model, found.local[k].lti)
-            if not (model.is_stable and error < most):
+        mode = untold.copy()  # a mode vanishes as a whole: what no longer matters, too
+        for j in np.flatnonzero(astray & ~untold):
+            more = mode.copy()
+            more[j] = True
+            if away(k, own, more)[0] < away(k, own, mode)[0] + _LIKE:
+                mode = more
+        for taken, most in ((astray, _LIKE), (mode, NEAR), (untold, NEAR)):
+            error, row, model = away(k, own, taken)
+            if not error < most:
                 continue
             theta[k], models[k], worst = row, model, max(worst, error)
             P = np.where(taken | taken[:, None], 0.0, covariance[k])

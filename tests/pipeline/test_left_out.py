@@ -44,14 +44,14 @@ def test_a_point_that_is_unlike_the_others_is_told(tables):
     pipeline = spring_pipeline(interpolator=AutoLPV())
     words = said(pipeline, X, turned)
     assert pipeline.interpolator_.form_ == "pchip"
-    assert "do not foresee point(s)" in words and "2 (scheduling 1:" in words
+    assert "operating point 2 (scheduling 1) has the reverse sign" in words
 
 
 def test_a_wrong_value_of_few_points_is_told():
     X, y = spring_tables(noise=1e-2, n_samples=300, kappas=[0.0, 0.5, 1.0, 1.5, 2.0])
     assert said(spring_pipeline(), X, y) == ""
     X = X.assign(kappa=X["kappa"].replace(1.0, 1.75))
-    assert "do not foresee point(s)" in said(spring_pipeline(), X, y)
+    assert "do not foresee point(s) 3 (scheduling 1.75" in said(spring_pipeline(), X, y)
 
 
 @pytest.mark.parametrize("together", [True, False])

@@ -504,6 +504,23 @@ def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
     np.testing.assert_array_equal(kept.theta, bent)
 
 
+def test_a_mode_that_vanishes_is_foreseen_as_a_whole():
+    """Its stiffness is sure only by what is wrong of its gain and damping."""
+    true = with_a_mode_that_vanishes(np.linspace(-20.0, 20.0, 7))
+    theta, covariance = true.theta.copy(), true.covariance.copy()
+    k2, d2, c2 = map(true.structure.parameter_names.index, ("k2", "d2", "c2"))
+    theta[3, [k2, d2, c2]] = 9.0, 3.0, 0.01
+    covariance[3, d2, d2], covariance[3, c2, c2] = 4.0**2, 1.0
+    noisy = theta[3].copy()
+    noisy[true.structure.parameter_names.index("c1")] *= 1.03  # as its record has it
+    local = list(true.local)
+    local[3] = SimpleNamespace(lti=true.structure.model(noisy))
+    spoilt = true._replace(theta=theta, covariance=covariance, local=local)
+    with pytest.warns(UserWarning, match="does not tell 'c2', 'd2', 'k2' at op"):
+        found = with_foreseen(spoilt)
+    assert abs(found.theta[3, k2] - 100.0) < 1.0
+
+
 def test_what_all_records_tell_is_left_alone():
     true = with_a_mode_that_vanishes(np.linspace(10.0, 20.0, 7))
     assert with_foreseen(true) is true

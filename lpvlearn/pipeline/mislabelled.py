@@ -1,0 +1,240 @@
+"""Operating points where a channel has another unit, sign or place than elsewhere.
+
+That leaves its mark on a response: a constant ratio to what the other points foresee.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Sequence
+from itertools import combinations, product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..exceptions import warn
+from ..models.scheduling_range import in_range_of_points
+from .left_out import forgetting, forgotten
+from .local_models import LocalModel
+from .runner import place_of
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Frequencies, from below the slowest pole to above the fastest by that factor, and the
+# part of the largest gain of a channel from which its response counts there.
+_N_FREQUENCIES, _BEYOND, _KNOWN = 100, 3.0, 0.05
+
+# Misfit of two responses, |G - R| / (|G| + |R|), of that part of the frequencies: up to
+# which they are alike, and the share of it that is left of a point when it is mended.
+_PART, _ALIKE, _LEFT = 0.7, 0.35, 0.4
+
+# A factor that is no law of the scheduling: so many times beyond what the other points
+# range over, which are not much themselves where it is a sign.
+_FAR, _RANGE = 5.0, 10.0
+
+_OTHERS = 3  # points that tell how much a channel varies
+
+_ROUND = 1.25  # from a power of ten, up to which a factor is told as that
+
+
+class _Mended(NamedTuple):
+    """What makes of the model at a point what the others foresee; the best first."""
+
+    n_channels: int
+    left: float  # the share of the misfit
+    message: str
+
+
+def tell_of_mislabelled(
+    local: Sequence[LocalModel],
+    kappa: Array,
+    longest: float,
+    inputs: Sequence[Hashable],
+    outputs: Sequence[Hashable],
+) -> bool:
+    """Warn of a point with channels in another unit, reversed, or exchanged.
+
+    Only where three or more others agree on what there is to be, whatever law they
+    follow, and where the mended response is that. Of the point of which that is
+    clearest: its neighbours may look odd beside it. What hardly decays in the `longest`
+    record (seconds) is forgotten.
+    """
+    if len(local) <= _OTHERS:
+        return False
+    labels = [f"output {name!r}" for name in outputs], [f"input {u!r}" for u in inputs]
+    if len(inputs) == len(outputs) == 1:  # nothing tells them apart
+        labels = ([f"{labels[0][0]} (or {labels[1][0]})"],) * 2
+    G = _responses(local, longest)
+    found = [min(_mended(G, kappa, k, labels), default=None) for k in range(len(G))]
+    told = [one for one in found if one is not None]
+    if told:
+        best = min(told, key=lambda one: one.left)
+        warn(
+            f"{best.message}. What else would be told of the models of the points may "
+            "follow from that, and is not told. Give the record as the others are, or "
+            "leave the point out, and fit again."
+        )
+    return bool(told)
+
+
+def _responses(local: Sequence[LocalModel], longest: float) -> Complex:
+    """Responses of the points, (n_points, n_freq, n_outputs, n_inputs)."""
+    models = [(one.own or one).lti.with_input_delay(0) for one in local]
+    rate = forgotten(models, longest)
+    models = [forgetting(model, rate) for model in models]
+    speeds = np.abs(np.concatenate([model.poles() for model in models]))
+    speeds = speeds[speeds > 0.0] if speeds.any() else np.ones(1)
+    ends = speeds.min() / _BEYOND, speeds.max() * _BEYOND
+    omega = np.geomspace(*ends, _N_FREQUENCIES)
+    with np.errstate(all="ignore"):
+        G = np.array([model.frequency_response(omega) for model in models])
+    return np.where(np.isfinite(G), G, 0.0)
+
+
+def _mended(
+    G: Complex, kappa: Array, k: int, labels: Sequence[Sequence[str]]
+) -> Iterator[_Mended]:
+    """What would make of the model at point k what the others foresee.
+
+    The factors of outputs, or of inputs, far from all that a law through the others
+    may have there; or two channels in one another's places.
+    """
+    others = np.delete(np.arange(len(G)), k)
+    own, rest, ways = G[k], G[others], _ways(kappa, others, k)
+    size = _size(rest)
+    near = np.argsort(np.linalg.norm(ways[0], axis=1), kind="stable")[:2]
+    foreseen = [*rest[near], *(_foreseen(rest, ways[0], degree) for degree in (1, 2))]
+    as_is = min(_misfit(own / size, R / size) for R in (*rest, *foreseen))
+    limit, place = min(_ALIKE, _LEFT * as_is), f"at {place_of(k, kappa)}"
+    for R, axis in product(foreseen, (1, 2)):
+        names, n = labels[axis - 1], own.shape[axis]
+        factors, *usual = (_gains(one / size, R / size, axis) for one in (own, *rest))
+        wrong = [
+            i
+            for i, gains in enumerate(np.transpose(usual))
+            if _is_no_law(factors[i], gains, ways)
+        ]
+        if wrong:
+            used = np.ones(n)
+            used[wrong] = factors[wrong]
+            left = _misfit(own / size, R * np.expand_dims(used, 2 - axis) / size)
+            if left < limit:
+                beside = _foreseen(np.array(usual), ways[0], 1)
+                faults = [
+                    f"{names[i]} {place} {_fault(factors[i] / beside[i])}"
+                    for i in wrong
+                ]
+                yield _Mended(len(wrong), left / as_is, "; ".join(faults))
+        for i, j in combinations(range(n), 2):
+            order = np.arange(n)
+            order[[i, j]] = j, i
+            turned: Complex = np.take(R, order, axis)
+            left = _misfit(own / size, turned / size)
+            if left < limit and all(
+                _misfit(one / size, R / size) < _misfit(one / size, turned / size)
+                for one in rest
+            ):
+                yield _Mended(
+                    2,
+                    left / as_is,
+                    f"{names[i]} and {names[j]} {place} look exchanged, by what the "
+                    "other points foresee: check which is which there",
+                )
+
+
+def _fault(factor: float) -> str:
+    """What is wrong of a channel, by its gain in that of the others: sign, or unit."""
+    size = max(abs(factor), 1.0 / abs(factor))
+    if size < _FAR and factor < 0.0:
+        return (
+            "has the reverse sign of what the other points foresee: check its wiring "
+            "and its sign there"
+        )
+    tens = float(10.0 ** np.round(np.log10(size)))
+    size = tens if max(size / tens, tens / size) < _ROUND else float(f"{size:.2g}")
+    times = f"{size:.12g} times" if abs(factor) > 1.0 else f"1/{size:.12g} of"
+    reverse = "in reverse " if factor < 0.0 else ""
+    return (
+        f"acts {reverse}as about {times} what the other points foresee: check its unit "
+        "there"
+    )
+
+
+def _ways(kappa: Array, others: NDArray[np.intp], k: int) -> list[Array]:
+    """How far the others are from a point: by the scheduling, and by its ratios."""
+    ways = [kappa, np.log(kappa)] if (kappa > 0.0).all() else [kappa]
+    return [x[others] - x[k] for x in map(in_range_of_points, ways)]
+
+
+def _foreseen(values: NDArray[Any], away: Array, degree: int) -> NDArray[Any]:
+    """At the point that others are `away` from, by a polynomial of the nearest."""
+    n = 1 + degree * away.shape[1]
+    near = np.argsort(np.linalg.norm(away, axis=1), kind="stable")[:n]
+    x = away[near]
+    powers = np.hstack([np.ones((len(x), 1)), *(x**p for p in range(1, degree + 1))])
+    flat = values[near].reshape(len(x), -1)
+    constant: NDArray[Any] = np.linalg.lstsq(powers, flat, rcond=None)[0][0]
+    return constant.reshape(values.shape[1:])
+
+
+def _is_no_law(factor: float, usual: Array, ways: Sequence[Array]) -> bool:
+    """Whether a gain is none that a law of the scheduling may have beside the others.
+
+    Of these none may be near to zero, or of another sign, nor what a law comes to. A
+    gain may change its sign towards an end of their range, not within it and back.
+    """
+    inside = ((ways[0] <= 0.0).any(axis=0) & (ways[0] >= 0.0).any(axis=0)).all()
+    if factor == 0.0 or not (usual > 0.0).all() or (factor < 0.0 and not inside):
+        return False
+    laws = [
+        law
+        for way, degree in product(ways, (1, 2))
+        for law in (
+            _foreseen(usual, way, degree),
+            np.exp(_foreseen(np.log(usual), way, degree)),
+        )
+    ]
+    low, high = (float(end([*usual, *laws])) for end in (min, max))
+    if low <= 0.0:
+        return False
+    size, wide = abs(factor), high / low
+    far = max(size / high, low / size) > _FAR * wide
+    return far or (factor < 0.0 and wide < _RANGE)
+
+
+def _gains(G: Complex, R: Complex, axis: int) -> Array:
+    """Of every channel of a response, how many times it is that of another."""
+    size, error = (np.abs(M).sum(axis=3 - axis) for M in (G, R))
+    turn = np.real(G * R.conj()).sum(axis=3 - axis)
+    found = np.zeros(size.shape[1])
+    for i, (own, other, way) in enumerate(zip(size.T, error.T, turn.T, strict=True)):
+        known = (own > _KNOWN * own.max()) & (other > _KNOWN * other.max())
+        if known.any():
+            ratio = np.exp(np.median(np.log(own[known] / other[known])))
+            found[i] = np.sign(np.median(way[known])) * ratio
+    return found
+
+
+def _misfit(G: Complex, R: Complex) -> float:
+    """How unlike two responses are, from 0 to 1: in the worst of their channels."""
+    worst = 0.0
+    for axis in (1, 2):
+        size = (np.abs(G) + np.abs(R)).sum(axis=axis)
+        error = np.abs(G - R).sum(axis=axis)
+        for whole, part in zip(size.T, error.T, strict=True):
+            known = whole > _KNOWN * whole.max()
+            if known.any():
+                relative = part[known] / whole[known]
+                worst = max(worst, float(np.quantile(relative, _PART)))
+    return worst
+
+
+def _size(G: Complex) -> Array:
+    """That of the channels (n_outputs, n_inputs): of outputs times that of inputs."""
+    size = np.median(np.sqrt(np.mean(np.abs(G) ** 2, axis=1)), axis=0)
+    found = np.ones_like(size)
+    for axis in (1, 0):
+        part = np.sqrt(np.mean((size / found) ** 2, axis=axis, keepdims=True))
+        found = found * np.where(part > 0.0, part, 1.0)
+    return found

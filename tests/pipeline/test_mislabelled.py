@@ -1,0 +1,87 @@
+"""Points with a channel in another unit, of another sign, or in another place."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import StateSpace
+from lpvlearn.exceptions import collected
+from lpvlearn.pipeline.local_models import LocalModel
+from lpvlearn.pipeline.mislabelled import tell_of_mislabelled
+
+KAPPA = np.arange(4.0)[:, None]
+ONES = np.ones(4)
+
+
+def oscillators(by_input=ONES, by_output=ONES):
+    """Position and speed by two inputs, with gains of the second ones at the points."""
+    models = []
+    for (kappa,), b, c in zip(KAPPA, by_input, by_output, strict=True):
+        A = [[0.0, 1.0], [-(4.0 + kappa**2), -0.8]]
+        B = np.array([[0.0, 0.0], [1.0, 0.3 + 0.2 * kappa]]) * [1.0, b]
+        models.append(StateSpace(A, B, [[1.0, 0.0], [0.0, c]], np.zeros((2, 2))))
+    return models
+
+
+def said(models):
+    local = [LocalModel(model, model.order, None) for model in models]
+    with collected() as told:
+        found = tell_of_mislabelled(local, KAPPA, 50.0, ["u", "v"], ["y", "z"])
+    assert found == bool(told)
+    return told[0].message if told else ""
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1e-3, 60.0, -1000.0])
+@pytest.mark.parametrize("point", [1, 2])
+def test_a_unit_is_told(factor, point):
+    gains = ONES.copy()
+    gains[point] = factor
+    place = f"at operating point {point} (scheduling {point}) acts "
+    size = max(abs(factor), 1.0 / abs(factor))
+    for words, name in (
+        (said(oscillators(by_output=gains)), "output 'z'"),
+        (said(oscillators(by_input=gains)), "input 'v'"),
+    ):
+        assert words.startswith(f"{name} {place}") and "check its unit" in words
+        assert ("in reverse" in words) == (factor < 0.0)
+        times = float(words.split("about ")[1].split(" ")[0].removeprefix("1/"))
+        assert 0.7 * size < times < 1.5 * size
+
+
+@pytest.mark.parametrize("point", [1, 2])
+def test_a_sign_is_told(point):
+    gains = ONES.copy()
+    gains[point] = -1.0
+    words = said(oscillators(by_input=gains))
+    assert words.startswith(
+        f"input 'v' at operating point {point} (scheduling {point})"
+    )
+    assert "has the reverse sign" in words
+
+
+@pytest.mark.parametrize("point", [1, 2])
+def test_outputs_that_are_exchanged_are_told(point):
+    models = oscillators()
+    one = models[point]
+    models[point] = StateSpace(one.A, one.B, one.C[::-1], one.D)
+    words = said(models)
+    assert words.startswith(f"output 'y' and output 'z' at operating point {point} ")
+    assert "look exchanged" in words
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        [1.0, 1.0, 1.0, 1.0],
+        [-1.0, 1.0, 1.0, 1.0],  # it may have gone through zero
+        [-1.5, -0.5, 0.5, 1.5],
+        [-2.0, -1.0, 1e-3, 1.0],
+        [1.0, -1.0, 1.0, 7.0],
+        [1.0, 10.0, 100.0, 1000.0],
+        [1000.0, 30.0, 6.0, 2.0],
+        [0.0, 1.0, 2.0, 3.0],
+        [1.0, 0.0, 1.0, 1.0],  # a dead input
+    ],
+)
+def test_laws_of_the_scheduling_are_none_of_these(law):
+    assert said(oscillators(by_input=law)) == ""
+    assert said(oscillators(by_output=law)) == ""
