@@ -94,11 +94,12 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
         known = _parameters(of_rate, around)
         if known is None:
             continue
-        theta, changes, bias = known
-        bend = max(map(_bend, changes, bias))
+        bend = max(_bend(point.changes, point.bias) for point in known)
         if best is None or bend < least:
             least = bend if best else _FAR_LESS * bend
-            best = CanonicalModels(whole, theta, changes.mT @ changes)
+            theta = np.array([point.theta for point in known])
+            covariance = np.array([one.changes.T @ one.changes for one in known])
+            best = CanonicalModels(whole, theta, covariance)
         if bend < _STRAIGHT:
             break
     return best
@@ -117,23 +118,31 @@ def _indices(order: int, n_outputs: int) -> Iterator[tuple[int, ...]]:
         yield tuple(each + (i in longer) for i in range(n_outputs))
 
 
+class _Point(NamedTuple):
+    """Parameters of a model, what is not known of them, and what noise biases them by.
+
+    Changes (k, n_params) with each of what is not known, by its standard deviation.
+    """
+
+    theta: Array
+    changes: Array
+    bias: Array
+
+
 def _parameters(
     structure: GrayBoxStructure, around: Sequence[Sequence[StateSpace]]
-) -> tuple[Array, Array, Array] | None:
-    """Parameters of points (n_points, n), their changes, and what noise biases them by.
-
-    Changes (n_points, k, n) with each of what is not known of a model, by its standard
-    deviation. Of groups of a model and the pairs about it; None where one has none.
-    """
-    form = CanonicalForm(structure, None)
-    rows = [[form.parameters(_matrix(m)) for m in group] for group in around]
-    if any(row is None for group in rows for row in group):
-        return None
-    points = np.array(rows)
-    at, up, down = points[:, 0], points[:, 1::2], points[:, 2::2]
-    changes = (up - down) / (2.0 * DEVIATION)
-    bias = 0.5 * (up + down - 2.0 * at[:, None]).sum(axis=1) / DEVIATION**2
-    return at, changes, bias
+) -> list[_Point] | None:
+    """Of groups of a model and the pairs about it; None where one has none."""
+    form, points = CanonicalForm(structure, None), []
+    for group in around:
+        rows = [form.parameters(_matrix(model)) for model in group]
+        known = [row for row in rows if row is not None]
+        if len(known) < len(rows):
+            return None
+        at, up, down = known[0], np.array(known[1::2]), np.array(known[2::2])
+        bias = 0.5 * (up + down - 2.0 * at).sum(axis=0) / DEVIATION**2
+        points.append(_Point(at, (up - down) / (2.0 * DEVIATION), bias))
+    return points
 
 
 def _bend(changes: Array, bias: Array) -> float:

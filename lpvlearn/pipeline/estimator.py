@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -562,9 +562,6 @@ list, default=None
             longest = self.sampling_time_ * kept.n_longest
             channels = experiments[0].input_names, self.output_names_
             wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
-            following = (
-                collected if wrong else nullcontext
-            )  # silent: it follows from that
             if restructurer in (None, "aligned") and not wrong:
                 quiet = replace(runner, verbose=0)
                 again = partial(identify, points=kept, runner=quiet)
@@ -576,7 +573,7 @@ list, default=None
                 tell_of_integrators(local, self.output_names_, longest)
             points = kept
 
-        with watch.step("restructuring", bar=True), following():  # step 4
+        with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
             if restructurer is None:
@@ -626,7 +623,7 @@ list, default=None
         steady = begins_held(self.lpv_, found.points, self.sampling_time_)
         self.lpv_ = replace(self.lpv_, steady_start=steady)
 
-        with watch.step("interpolation and report"), following():
+        with watch.step("interpolation and report"):
             self.output_errors_ = (
                 local_output_errors(self.lpv_, found, self.sampling_time_)
                 if self.refiner_ is None

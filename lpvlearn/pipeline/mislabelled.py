@@ -71,9 +71,8 @@ def tell_of_mislabelled(
     if told:
         best = min(told, key=lambda one: one.left)
         warn(
-            f"{best.message}. What else would be told of the models of the points may "
-            "follow from that, and is not told. Give the record as the others are, or "
-            "leave the point out, and fit again."
+            f"{best.message}. What else is told of the points may follow from that. "
+            "Give the record as the others are, or leave the point out, and fit again."
         )
     return bool(told)
 
