@@ -100,8 +100,8 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
             theta = np.array([point.theta for point in known])
             covariance = np.array([one.changes.T @ one.changes for one in known])
             best = CanonicalModels(whole, theta, covariance)
-        if bend < _STRAIGHT:
-            break
+            if bend < _STRAIGHT:
+                break
     return best
 
 
