@@ -66,7 +66,7 @@ def tell_of_mislabelled(
     if len(inputs) == len(outputs) == 1:  # nothing tells them apart
         labels = ([f"{labels[0][0]} (or {labels[1][0]})"],) * 2
     G = _responses(local, longest)
-    found = [min(_mended(G, kappa, k, labels), default=None) for k in range(len(G))]
+    found = [_mended(G, kappa, k, labels) for k in range(len(G))]
     told = [one for one in found if one is not None]
     if told:
         best = min(told, key=lambda one: one.left)
@@ -93,53 +93,88 @@ def _responses(local: Sequence[LocalModel], longest: float) -> Complex:
 
 def _mended(
     G: Complex, kappa: Array, k: int, labels: Sequence[Sequence[str]]
-) -> Iterator[_Mended]:
+) -> _Mended | None:
     """What would make of the model at point k what the others foresee.
 
     The factors of outputs, or of inputs, far from all that a law through the others
     may have there; or two channels in one another's places.
     """
     others = np.delete(np.arange(len(G)), k)
-    own, rest, ways = G[k], G[others], _ways(kappa, others, k)
-    size = _size(rest)
-    near = np.argsort(np.linalg.norm(ways[0], axis=1), kind="stable")[:2]
-    foreseen = [*rest[near], *(_foreseen(rest, ways[0], degree) for degree in (1, 2))]
-    as_is = min(_misfit(own / size, R / size) for R in (*rest, *foreseen))
-    limit, place = min(_ALIKE, _LEFT * as_is), f"at {place_of(k, kappa)}"
+    ways, size, place = _ways(kappa, others, k), _size(G[others]), place_of(k, kappa)
+    own, rest = G[k] / size, G[others] / size
+    nearest = np.argsort(np.linalg.norm(ways[0], axis=1), kind="stable")
+    ahead = [_foreseen(rest, ways[0], degree) for degree in (1, 2)]
+    foreseen = [*rest[nearest[:2]], *ahead]
+    found: list[_Mended] = []
     for R, axis in product(foreseen, (1, 2)):
-        names, n = labels[axis - 1], own.shape[axis]
-        factors, *usual = (_gains(one / size, R / size, axis) for one in (own, *rest))
-        wrong = [
-            i
-            for i, gains in enumerate(np.transpose(usual))
-            if _is_no_law(factors[i], gains, ways)
-        ]
-        if wrong:
-            used = np.ones(n)
-            used[wrong] = factors[wrong]
-            left = _misfit(own / size, R * np.expand_dims(used, 2 - axis) / size)
-            if left < limit:
-                beside = _foreseen(np.array(usual), ways[0], 1)
-                faults = [
-                    f"{names[i]} {place} {_fault(factors[i] / beside[i])}"
-                    for i in wrong
-                ]
-                yield _Mended(len(wrong), left / as_is, "; ".join(faults))
-        for i, j in combinations(range(n), 2):
-            order = np.arange(n)
-            order[[i, j]] = j, i
-            turned: Complex = np.take(R, order, axis)
-            left = _misfit(own / size, turned / size)
-            if left < limit and all(
-                _misfit(one / size, R / size) < _misfit(one / size, turned / size)
-                for one in rest
-            ):
-                yield _Mended(
-                    2,
-                    left / as_is,
-                    f"{names[i]} and {names[j]} {place} look exchanged, by what the "
-                    "other points foresee: check which is which there",
-                )
+        names = [f"{name} at {place}" for name in labels[axis - 1]]
+        found += _rescaled(own, R, rest, rest[nearest[0]], ways, axis, names)
+        found += _exchanged(own, R, rest, size, axis, labels[axis - 1], place)
+    if not found:
+        return None
+    as_is = min(_misfit(own, R) for R in (*rest, *foreseen))
+    found = [one for one in found if one.left < _LEFT * as_is]
+    best = min(found, default=None)
+    return None if best is None else best._replace(left=best.left / as_is)
+
+
+def _rescaled(
+    own: Complex,
+    R: Complex,
+    rest: Complex,
+    nearest: Complex,
+    ways: Sequence[Array],
+    axis: int,
+    names: Sequence[str],
+) -> Iterator[_Mended]:
+    """With other factors of the channels of an axis, if these are no law."""
+    factors, beside = (_gains(one, R, axis) for one in (own, nearest))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(factors / beside)
+    # all of a law is wider than one of its points: the others need not be asked
+    far = (ratio > _FAR) | (ratio < 1.0 / _FAR) | (factors < 0.0)
+    if not far.any():
+        return
+    usual = np.array([_gains(one, R, axis) for one in rest])
+    wrong = [
+        i
+        for i in np.flatnonzero(far).tolist()
+        if _is_no_law(factors[i], usual[:, i], ways)
+    ]
+    if not wrong:
+        return
+    used = np.ones(len(factors))
+    used[wrong] = factors[wrong]
+    left = _misfit(own, R * np.expand_dims(used, 2 - axis))
+    if left < _ALIKE:
+        factors = factors / _foreseen(usual, ways[0], 1)
+        faults = [f"{names[i]} {_fault(factors[i])}" for i in wrong]
+        yield _Mended(len(wrong), left, "; ".join(faults))
+
+
+def _exchanged(
+    own: Complex,
+    R: Complex,
+    rest: Complex,
+    size: Array,
+    axis: int,
+    names: Sequence[str],
+    place: str,
+) -> Iterator[_Mended]:
+    """With two channels of an axis in one another's places, if no other point is so."""
+    n = own.shape[axis]
+    for i, j in combinations(range(n), 2):
+        order = np.arange(n)
+        order[[i, j]] = j, i
+        turned: Complex = np.take(R * size, order, axis) / size
+        left = _misfit(own, turned)
+        if left < _ALIKE and all(_misfit(x, R) < _misfit(x, turned) for x in rest):
+            yield _Mended(
+                2,
+                left,
+                f"{names[i]} and {names[j]} at {place} look exchanged, by what the "
+                "other points foresee: check which is which there",
+            )
 
 
 def _fault(factor: float) -> str:
@@ -186,14 +221,15 @@ def _is_no_law(factor: float, usual: Array, ways: Sequence[Array]) -> bool:
     inside = ((ways[0] <= 0.0).any(axis=0) & (ways[0] >= 0.0).any(axis=0)).all()
     if factor == 0.0 or not (usual > 0.0).all() or (factor < 0.0 and not inside):
         return False
-    laws = [
-        law
-        for way, degree in product(ways, (1, 2))
-        for law in (
-            _foreseen(usual, way, degree),
-            np.exp(_foreseen(np.log(usual), way, degree)),
-        )
-    ]
+    with np.errstate(over="ignore"):  # of a law that comes to anything there
+        laws = [
+            law
+            for way, degree in product(ways, (1, 2))
+            for law in (
+                _foreseen(usual, way, degree),
+                np.exp(_foreseen(np.log(usual), way, degree)),
+            )
+        ]
     low, high = (float(end([*usual, *laws])) for end in (min, max))
     if low <= 0.0:
         return False

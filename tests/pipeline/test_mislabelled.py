@@ -22,10 +22,10 @@ def oscillators(by_input=ONES, by_output=ONES):
     return models
 
 
-def said(models):
+def said(models, kappa=KAPPA):
     local = [LocalModel(model, model.order, None) for model in models]
     with collected() as told:
-        found = tell_of_mislabelled(local, KAPPA, 50.0, ["u", "v"], ["y", "z"])
+        found = tell_of_mislabelled(local, kappa, 50.0, ["u", "v"], ["y", "z"])
     assert found == bool(told)
     return told[0].message if told else ""
 
@@ -85,3 +85,8 @@ def test_outputs_that_are_exchanged_are_told(point):
 def test_laws_of_the_scheduling_are_none_of_these(law):
     assert said(oscillators(by_input=law)) == ""
     assert said(oscillators(by_output=law)) == ""
+
+
+def test_laws_that_overflow_far_from_the_points_are_laws():
+    kappa = np.array([[0.0], [1e-3], [2e-3], [3.0]])
+    assert said(oscillators(by_output=[1.0, 10.0, 100.0, 1.0]), kappa) == ""
