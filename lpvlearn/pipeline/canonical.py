@@ -9,8 +9,8 @@ covariances, and foresee one another by it, happens by no chance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations, islice
+from collections.abc import Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..lpv.weighting import noise_explains
 from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
+from ..structures.templates import generic_indices
 from ..systems.least_squares import RCOND, column_scale
 from .black_boxes import of_rates
 from .left_out import (
@@ -70,7 +71,7 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
     """None where a model has no such form, or its covariance is not known.
 
     Of the outputs and derivatives that may be the states, the usual ones: or others, of
-    which noise bends the parameters (`_bend`) far less.
+    which noise bends the parameters far less.
     """
     integrating = local[0].integrating
     models = [of_rates(model.lti, integrating) for model in local]
@@ -86,7 +87,7 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
     sizes = first.order, first.n_inputs, first.n_outputs
     direct = any(bool(model.D.any()) for model in models)
     best, least = None, np.inf
-    for indices in islice(_indices(*sizes[::2]), _MOST_CHAINS):
+    for indices in islice(generic_indices(*sizes[::2]), _MOST_CHAINS):
         of_rate, whole = (
             GrayBoxStructure.observable_canonical(*sizes, direct, some, indices)
             for some in ((), integrating)
@@ -94,28 +95,15 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
         known = _parameters(of_rate, around)
         if known is None:
             continue
-        bend = max(_bend(point.changes, point.bias) for point in known)
+        bend = max(point.bend for point in known)
         if best is None or bend < least:
             least = bend if best else _FAR_LESS * bend
             theta = np.array([point.theta for point in known])
-            covariance = np.array([one.changes.T @ one.changes for one in known])
+            covariance = np.array([point.covariance for point in known])
             best = CanonicalModels(whole, theta, covariance)
             if bend < _STRAIGHT:
                 break
     return best
-
-
-def _indices(order: int, n_outputs: int) -> Iterator[tuple[int, ...]]:
-    """Lengths of the chains of states that outputs head, the usual ones first.
-
-    They differ by one at most.
-
-    >>> list(_indices(3, 2)), list(_indices(4, 2))
-    ([(2, 1), (1, 2)], [(2, 2)])
-    """
-    each, n_longer = divmod(order, n_outputs)
-    for longer in combinations(range(n_outputs), n_longer):
-        yield tuple(each + (i in longer) for i in range(n_outputs))
 
 
 class _Point(NamedTuple):
@@ -127,6 +115,21 @@ class _Point(NamedTuple):
     theta: Array
     changes: Array
     bias: Array
+
+    @property
+    def covariance(self) -> Array:
+        return self.changes.T @ self.changes
+
+    @property
+    def bend(self) -> float:
+        """The bias of parameters that bend with noise, in their standard deviations.
+
+        ``sqrt(b^T P^+ b)``: the shortest step of what is not known that moves them so.
+        """
+        unit = column_scale(self.changes)
+        rows = (self.changes / unit).T
+        step = np.linalg.lstsq(rows, self.bias / unit, rcond=RCOND)[0]
+        return float(np.linalg.norm(step))
 
 
 def _parameters(
@@ -143,16 +146,6 @@ def _parameters(
         bias = 0.5 * (up + down - 2.0 * at).sum(axis=0) / DEVIATION**2
         points.append(_Point(at, (up - down) / (2.0 * DEVIATION), bias))
     return points
-
-
-def _bend(changes: Array, bias: Array) -> float:
-    """The bias of parameters that bend with noise, in their standard deviations.
-
-    ``sqrt(b^T P^+ b)``: the shortest step of what is not known that moves them so.
-    """
-    unit = column_scale(changes)
-    step = np.linalg.lstsq((changes / unit).T, bias / unit, rcond=RCOND)[0]
-    return float(np.linalg.norm(step))
 
 
 def is_better_form(

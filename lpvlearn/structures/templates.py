@@ -11,7 +11,8 @@ coefficients or in its error. (Python's own would normalise names, and warn.)
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 from keyword import iskeyword
 from typing import Any, NoReturn
 from unicodedata import normalize
@@ -307,10 +308,23 @@ def observable_canonical_cells(
     return A, B, C, D
 
 
+def generic_indices(order: int, n_outputs: int) -> Iterator[tuple[int, ...]]:
+    """Lengths of the chains of states that outputs head, those of the form first.
+
+    They differ by one at most.
+
+    >>> list(generic_indices(3, 2)), list(generic_indices(4, 2))
+    ([(2, 1), (1, 2)], [(2, 2)])
+    """
+    each, n_longer = divmod(order, n_outputs)
+    for longer in combinations(range(n_outputs), n_longer):
+        yield tuple(each + (i in longer) for i in range(n_outputs))
+
+
 def _chains(order: int, n_outputs: int, indices: Sequence[int] | None) -> list[int]:
     """Lengths of the chains of states, of every output."""
     if indices is None:
-        return [order // n_outputs + (i < order % n_outputs) for i in range(n_outputs)]
+        indices = next(generic_indices(order, n_outputs))
     lengths = []
     if has_one_axis(indices):
         lengths = [whole_number("indices", length, 0) for length in indices]

@@ -376,7 +376,10 @@ class _Trial:
         return [e[cut:] for e, cut in zip(errors, cuts, strict=True)]
 
     def loss(self, delay: Delay, size: _Size, j: int) -> float:
-        """Mean square of the simulation errors; at least that of rounding."""
+        """Mean square of the simulation errors; at least that of rounding.
+
+        Without D of input j, unless that is `direct`: then it is one for all of them.
+        """
         key = (*delay.tolist(), *size, -1 if size.direct else j)
         if key not in self.known:
             mean = float(np.mean(np.concatenate(self.errors(delay, size, j)) ** 2))
