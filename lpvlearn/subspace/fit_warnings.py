@@ -551,7 +551,7 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> bool:
     poor = fitted.residual > USELESS and not fitted.evidence.whitening.of_differences
     if poor and _tells_of_glitches(fitted, telling):
         return False
-    bend = find_bend(fitted.evidence)
+    bend = find_bend(fitted.evidence, apart="contradiction" in telling)
     if bend is None:
         return False
     output, (cause, *others) = telling.output(bend.output), bend.causes

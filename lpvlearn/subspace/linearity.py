@@ -105,12 +105,14 @@ class _Terms(NamedTuple):
 
 
 @one_blas_thread
-def find_bend(evidence: Evidence) -> Bend | None:
+def find_bend(evidence: Evidence, *, apart: bool = False) -> Bend | None:
     """The first output whose errors clearly are bent, and not just by a little.
 
     By powers of signals, by what these lose in play, or by large changes of the inputs,
     whichever explains most. Outputs that are left unexplained are asked themselves
     first. Errors of a model that is unstable may be anything, and are not looked at.
+    Of experiments that are `apart`, with linear systems of their own, what lagged
+    inputs explain is taken from each.
     """
     records = thinned(evidence.records, _BENT_SAMPLES)
     records = [record for record in records if record.n_samples > 2 * N_LAGS]
@@ -121,15 +123,18 @@ def find_bend(evidence: Evidence) -> Bend | None:
     )
     with np.errstate(over="ignore", invalid="ignore"):
         errors = simulation_errors(model, records)
-    bend = _bend_ahead(records, errors)
+    bend = _bend_ahead(records, errors, apart)
     finite = np.isfinite(model.loss) and all(np.isfinite(e).all() for e in errors)
     if bend is not None or not finite:
         return bend
-    return _bend_of_simulation(model, records, errors)
+    return _bend_of_simulation(model, records, errors, apart)
 
 
 def _bend_of_simulation(
-    model: Realization, records: Sequence[Record], errors: Sequence[Array]
+    model: Realization,
+    records: Sequence[Record],
+    errors: Sequence[Array],
+    apart: bool,
 ) -> Bend | None:
     """What signals that the inputs give tell of the errors of simulation."""
     A, B, C, D = model.A, model.B, model.C, model.D
@@ -171,13 +176,15 @@ def _bend_of_simulation(
         )
     errors = [e[n_lags:] for e in errors]
     for i in large:
-        causes = _causes(terms, [e[:, i] for e in errors], i, least[i])
+        causes = _causes(terms, [e[:, i] for e in errors], i, apart, least[i])
         if causes:
             return Bend(i, causes)
     return None
 
 
-def _bend_ahead(records: Sequence[Record], errors: Sequence[Array]) -> Bend | None:
+def _bend_ahead(
+    records: Sequence[Record], errors: Sequence[Array], apart: bool
+) -> Bend | None:
     """What measured signals tell of the next sample, of outputs left unexplained."""
     m, ny = len(records[0].u), len(records[0].y)
     whole = np.hstack([np.vstack((record.u, record.y)) for record in records])
@@ -205,7 +212,8 @@ def _bend_ahead(records: Sequence[Record], errors: Sequence[Array]) -> Bend | No
         terms.append(_Terms(own[n_lags:], linear[n_lags:], [b[n_lags:] for b in bent]))
         outputs.append(z[n_lags:, m:])
     for i in poor:
-        causes = _causes(terms, [y[:, i] for y in outputs], i, _ROUNDING, ahead=True)
+        news = [y[:, i] for y in outputs]
+        causes = _causes(terms, news, i, apart, _ROUNDING, ahead=True)
         if causes:
             return Bend(i, causes, ahead=True)
     return None
@@ -237,6 +245,7 @@ def _causes(
     terms: Sequence[_Terms],
     errors: Sequence[Array],
     output: int,
+    apart: bool,
     least: float,
     *,
     ahead: bool = False,
@@ -251,15 +260,19 @@ def _causes(
         np.column_stack([one.own[:, output], one.linear, *one.bent, e])
         for one, e in zip(terms, errors, strict=True)
     ]
+    n_rows = [len(part) for part in signals]
+    least_rows = _ROWS_PER_TERM * (n_linear + max(sizes) + 1)
+    if (min(n_rows) if apart else sum(n_rows)) < least_rows:
+        return ()
+    if apart:
+        n_linear, n_own = 0, n_own + n_linear
     # What is left of the errors is filtered: what the model lacks is no noise.
     columns = _rows(signals, np.ones(1), n_own)
-    if len(columns) < _ROWS_PER_TERM * (n_linear + max(sizes) + 1):
-        return ()
     plain = without(of_size_one(columns[:, :n_linear]), columns[:, n_linear:])[0]
     noise = plain[:, -1:]
     if not noise.std() > least:
         return ()
-    stops = np.cumsum([len(part) for part in signals])[:-1]
+    stops = np.cumsum(n_rows)[:-1]
     (a,) = whitening_filters(np.split(noise, stops))
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)

@@ -9,7 +9,7 @@ from scipy.signal import butter, lfilter
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.subspace.linearity import _large_changes, find_bend
 
-from ..conftest import modes
+from ..conftest import modes, spring_tables
 from .test_residuals import coloured
 
 
@@ -182,3 +182,12 @@ def test_no_noise_makes_a_linear_system_seem_bent(noise):
         }[noise]
         y += 0.2 * y.std() / e.std() * e
         SubspaceLTI(1, horizon=8, offset="constant").fit(u, y)  # silently
+
+
+@pytest.mark.filterwarnings("ignore:Experiment.s. 2")  # at another operating point
+def test_experiments_of_other_linear_systems_are_not_bent():
+    X, y = spring_tables(noise=1e-3, n_samples=60, kappas=(0.0, 0.75, 1.5))
+    model = SubspaceLTI(2, method="po-moesp", horizon=5, refine=False, offset=None)
+    model.set_params(inputs="force", experiment="run", time="time").fit(X, y)
+    assert find_bend(model._evidence) is not None  # as of one system
+    assert find_bend(model._evidence, apart=True) is None
