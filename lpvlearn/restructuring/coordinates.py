@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..models.system_matrix import blocks
 from ..systems.balancing import balancing_transformation
+from ..systems.least_squares import column_scale
 from .error_system import ErrorSystem, Target, derivatives
 from .least_squares import fit_frequency_response
 from .limits import Limits, within_bounds
@@ -324,9 +325,13 @@ class CanonicalForm:
         distance of `exact`.
         """
         n, structure = self.structure.order, self.structure
-        model = Target.of(S, n, self.dt)
+        # Outputs of like size: what is left of a solution is rounded by the largest.
+        unit = np.ones((len(S), 1))
+        unit[n:, 0] = column_scale(S[n:, :n].T)
+        model = Target.of(S / unit, n, self.dt)
         rate = _rate(model.A, self.dt)
-        problem = scaled_problem(model, structure.offset, structure.basis, rate)
+        offset, basis = structure.offset / unit, structure.basis / unit
+        problem = scaled_problem(model, offset, basis, rate)
         M, b = linear_equations(problem)
         if len(b) < n * n:
             return None

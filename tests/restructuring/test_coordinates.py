@@ -195,6 +195,22 @@ def test_all_canonical_forms_of_one_order_end_at_the_same_norm():
     assert min(errors) >= bound * (1 - 1e-9)
 
 
+def test_units_of_outputs_cost_a_canonical_form_no_digits():
+    rng = np.random.default_rng(6)
+    A, unit = rng.standard_normal((5, 5)), np.array([1e-5, 1.0, 1e6])
+    B, C = rng.standard_normal((5, 2)), rng.standard_normal((3, 5))
+    A, D = A - 3.0 * np.eye(5), np.zeros((3, 2))
+    structure = GrayBoxStructure.observable_canonical(5, 2, 3)
+    form = CanonicalForm(structure, None)
+    plain = form.parameters(np.block([[A, B], [C, D]]))
+    other = form.parameters(np.block([[A, B], [unit[:, None] * C, D]]))
+    ours, theirs = structure.model(plain), structure.model(other)
+    T = np.diag(1.0 / np.repeat(unit, [2, 2, 1]))  # outputs and their rates
+    back = theirs.transform(T)
+    np.testing.assert_allclose(back.A, ours.A, rtol=0, atol=1e-11 * abs(ours.A).max())
+    np.testing.assert_allclose(back.B, ours.B, rtol=0, atol=1e-11 * abs(ours.B).max())
+
+
 def test_a_model_that_is_not_minimal_has_no_chart():
     model = StateSpace(np.diag([-1.0, -2.0]), [[1.0], [0.0]], [[1.0, 1.0]])
     with pytest.raises(ValueError, match="not minimal"):
