@@ -103,6 +103,11 @@ class LocalModel:
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
 
+    @property
+    def order_of_rates(self) -> int:
+        """As the estimator counts, without integrators."""
+        return self.order - len(self.integrating)
+
     def deviated(self) -> list[ModelPair]:
         """The pairs in continuous time; none where one of them has no equivalent.
 
@@ -187,7 +192,9 @@ def identify_points(
         if len({model.order for model in models}) > 1:
             order = _common_order(models)
             alike = [
-                done if done is not None and _own_order(done.result) == order else None
+                done
+                if done is not None and done.result.order_of_rates == order
+                else None
                 for done in found
             ]
             own, found = found, identify(clone(local).set_params(order=order), alike)
@@ -337,14 +344,14 @@ def _of_own_orders(
     What the `scouts` among them take tells the others where to look. One that finds its
     order at an end of that looks everywhere, as those have that are `known`.
     """
-    orders = [_own_order(done.result) for done in scouts if done is not None]
+    orders = [done.result.order_of_rates for done in scouts if done is not None]
     if not orders:
         return identify(local, known)
     about = range(max(0, min(orders) - _FEWER), max(orders) + _MORE + 1)
     found = identify(clone(local).set_params(order=about), scouts)
     ends = {about[0], about[-1]} - {0}
     unsure = [
-        scout is None and done is not None and _own_order(done.result) in ends
+        scout is None and done is not None and done.result.order_of_rates in ends
         for scout, done in zip(scouts, found, strict=True)
     ]
     if not any(unsure):
@@ -369,7 +376,7 @@ def _drifting_alike(
     models = [done.result for done in found if done is not None]
     sound = [model for model in models if model.n_trend > 1 and not model.lasts]
     most = _common_order(sound) if sound else np.inf
-    doubtful = [m.lasts or (m.n_trend < 2 and _own_order(m) > most) for m in models]
+    doubtful = [m.lasts or (m.n_trend < 2 and m.order_of_rates > most) for m in models]
     if not any(doubtful) and len(models) == len(found):
         return found
     drifting = clone(local).set_params(offset="linear")
@@ -385,7 +392,7 @@ def _drifting_alike(
             for k, done in enumerate(known)
             if done is None
             or done.result.n_trend < 2
-            or _own_order(done.result) > highest
+            or done.result.order_of_rates > highest
         ]
         return anew(known, again)
 
@@ -393,7 +400,7 @@ def _drifting_alike(
     first = anew(found, lasting)
     order = _common_order(models) if models else 0
     for one in [first[k] for k in lasting]:
-        if one is not None and one.result.lasts and _own_order(one.result) <= order:
+        if one is not None and one.result.lasts and one.result.order_of_rates <= order:
             return found  # where a drift is no help to one of them it is to none
     others = drifts(first, np.inf)
     with_them = [done.result for done in others if done is not None]
@@ -408,7 +415,7 @@ def _drifting_alike(
         return found
     if not models:
         return others
-    better = sum(_cost(m, order) - _cost(m, _own_order(m)) for m in models)
+    better = sum(_cost(m, order) - _cost(m, m.order_of_rates) for m in models)
     for one, other in zip(found, with_them, strict=True):
         better += one.result.criterion - other.criterion if one is not None else 0.0
     return others if better > 0.0 and highest <= order else found
@@ -421,18 +428,13 @@ def _beside(found: Done | None, own: Done | None) -> Done | None:
     return found._replace(result=replace(found.result, own=own.result))
 
 
-def _own_order(model: LocalModel) -> int:
-    """As the estimator counts, without integrators."""
-    return model.order - len(model.integrating)
-
-
 def _common_order(models: Sequence[LocalModel]) -> int:
     """The order of least cost to all points together, of those that one of them takes.
 
     Their records are independent: likelihoods multiply, and a state that one point in
     nine takes from its noise is not had by all. The highest one where costs are untold.
     """
-    orders = sorted({_own_order(model) for model in models})
+    orders = sorted({model.order_of_rates for model in models})
     if not all(model.costs for model in models):
         return orders[-1]
     total = dict.fromkeys(orders, 0.0)
