@@ -62,15 +62,10 @@ from ..validation import (
     verbosity,
 )
 from .black_boxes import channel_sizes, foreseen_order
+from .common_choices import common_delay, identify_points
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
-from .local_models import (
-    LocalModel,
-    common_delay,
-    estimates_outputs,
-    identify_points,
-    tell_of_integrators,
-)
+from .local_models import LocalModel, estimates_outputs, tell_of_integrators
 from .memory import checked_memory
 from .mislabelled import tell_of_mislabelled
 from .output_error import (

@@ -64,14 +64,9 @@ from ..validation import (
 )
 from .bands import output_errors
 from .black_boxes import balanced_entries
+from .common_choices import common_delay, identify_points, of_structure
 from .error_warnings import tell_of_errors, tell_of_noisy_scheduling
-from .local_models import (
-    balanced_by_motion,
-    common_delay,
-    identify_point,
-    identify_points,
-    of_structure,
-)
+from .local_models import balanced_by_motion, identify_point
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
