@@ -15,12 +15,7 @@ from joblib import Memory
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import (
-    NO_TIME,
-    Experiment,
-    naming,
-    read_outputs,
-)
+from ..data.experiments import NO_TIME, Experiment, naming
 from ..data.operating_points import (
     check_outputs,
     local_experiments,
@@ -28,6 +23,7 @@ from ..data.operating_points import (
     without_spikes,
 )
 from ..data.preparation import complete_runs, part_of
+from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected
 from ..lpv.auto import AutoLPV
