@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..validation import whole_number
-from .experiments import Table, group_rows, tolerances
+from .experiments import group_rows
+from .operating_points import tolerances
+from .tables import Table
 
 Array = NDArray[np.float64]
 

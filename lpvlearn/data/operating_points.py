@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,8 +17,9 @@ from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
-from ..validation import listed, squarable
-from .experiments import Experiment, tolerances
+from ..validation import listed, shown, squarable
+from .experiments import Experiment
+from .tables import as_numbers
 
 Array = NDArray[np.float64]
 
@@ -481,3 +483,14 @@ def tell_of_joint_scheduling(kappa: Array, names: Sequence[Hashable]) -> None:
         "these points the LPV model extrapolates, though within the range of each "
         "variable. Measure at other combinations, or use one of them alone."
     )
+
+
+def tolerances(argument: str, values: Any, n: int) -> Array:
+    """One for each of `n` scheduling variables, which may be given as one number."""
+    given = as_numbers(argument, values)
+    if given.shape not in ((1,), (n,)) or not (given >= 0).all():
+        raise ValueError(
+            f"`{argument}` must be a non-negative number, or one per scheduling "
+            f"variable ({n}). Got {shown(values)}."
+        )
+    return np.broadcast_to(given, n)

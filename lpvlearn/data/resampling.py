@@ -13,7 +13,8 @@ from scipy.ndimage import convolve1d
 
 from ..validation import SQUARED, flag, number, one_of, positive_time
 from .alignment import align_outputs
-from .experiments import Column, Table, as_list, group_rows, is_table
+from .experiments import group_rows
+from .tables import Column, Table, as_list, is_table
 from .timestamps import missing_after, time_in_seconds
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from sklearn.metrics import r2_score
 from ..exceptions import DivergenceError, collected, warn
 from ..validation import SQUARED, squarable, weights
 from .alignment import align_outputs
-from .experiments import read_outputs
+from .tables import read_outputs
 
 Array = NDArray[np.float64]
 

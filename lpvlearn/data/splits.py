@@ -65,15 +65,9 @@ from sklearn.utils.validation import check_consistent_length, column_or_1d
 
 from ..exceptions import VersionedPickle
 from ..validation import flag, naming_argument, one_of, whole_number
-from .experiments import (
-    Column,
-    Experiment,
-    Table,
-    group_rows,
-    operating_point_of,
-    roles_of,
-)
+from .experiments import Experiment, group_rows, operating_point_of, roles_of
 from .operating_points import group_operating_points
+from .tables import Column, Table
 
 __all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 from ..metrics.scorers import unwrapped
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace

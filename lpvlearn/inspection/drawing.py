@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 
 WIDTH = 8.0  # inches: 800 pixels at matplotlib's 100 dots per inch
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 from ..models.frequencies import nyquist_frequency
 from ..models.statespace import StateSpace
 

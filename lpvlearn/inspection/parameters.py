@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 from ..models.scheduling_range import domains
 from .drawing import (
     axes_grid,

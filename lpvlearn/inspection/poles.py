@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 from .drawing import (
     MUTED,
     axes_grid,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ..data.alignment import align_outputs
-from ..data.experiments import Table, as_numbers, read_outputs
 from ..data.preparation import read_runs
+from ..data.tables import Table, as_numbers, read_outputs
 from ..metrics.scorers import unwrap
 from ..subspace import SubspaceLTI
 from ..subspace.residuals import (

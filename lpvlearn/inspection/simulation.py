@@ -9,13 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.alignment import align_outputs, beside
-from ..data.experiments import (
-    ROLES,
-    Table,
-    as_numbers,
-    fitted_roles,
-    read_outputs,
-)
+from ..data.experiments import ROLES, fitted_roles
+from ..data.tables import Table, as_numbers, read_outputs
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate, unwrap
 from ..metrics.scores import best_fit

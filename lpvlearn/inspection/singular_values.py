@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..data.experiments import as_numbers
+from ..data.tables import as_numbers
 from ..metrics.scorers import unwrapped
 from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, drawable, single_axes, tidy, whole
 

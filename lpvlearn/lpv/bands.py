@@ -23,6 +23,7 @@ from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from ..systems.least_squares import diagonal_scale
 from .model import LPVStateSpace
 from .refinement import (
     Own,
@@ -34,7 +35,6 @@ from .refinement import (
     weighted_slopes,
 )
 from .sensitivity import coefficients_of, output_slopes, with_coefficients
-from .weighting import sizes_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -155,7 +155,7 @@ def left_out_errors(
     for grams in several:
         G += grams
     H = information + G[:, 1:, 1:].sum(axis=0)
-    size = sizes_of(H)
+    size = diagonal_scale(H)
     out = [e.copy() for e in errors]
     for fold, gram in enumerate(G):
         left, g = (H - gram[1:, 1:]) / size[:, None] / size, gram[0, 1:] / size

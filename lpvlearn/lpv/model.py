@@ -658,9 +658,11 @@ class LPVStateSpace(VersionedPickle):
         ExtrapolationWarning
             Outside of `identified_range`.
         """
-        _, kappa, late, x = self._run(u, scheduling, sampling_time, initial_state)
-        y = self._response(late[:, :, None], kappa, sampling_time, x[:, None])
-        return y[:, :, 0]
+        u, kappa, delay, start = self._started(
+            u, scheduling, sampling_time, initial_state
+        )
+        late, x = self._driving(u, delay, start), start[: self.order, None]
+        return self._response(late, kappa, sampling_time, x)[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
         """Outputs that each unit initial state, and input in transit, causes.
@@ -711,14 +713,18 @@ class LPVStateSpace(VersionedPickle):
         ValueError
             As `simulate`.
         """
-        u, kappa, late, x = self._run(u, scheduling, sampling_time, None)
-        units, states = self._unit_runs(kappa, self._samples_of_delay(sampling_time))
-        still = np.zeros((len(u), late.shape[1] - units.shape[1], units.shape[2]))
-        late = np.concatenate(
-            [late[:, :, None], np.concatenate([units, still], axis=1)], axis=2
-        )
-        start = np.column_stack([x, states])
-        y = self._response(late, kappa, sampling_time, start)
+        run = self._started(u, scheduling, sampling_time, None)
+        return self._rest_and_free(*run, sampling_time)
+
+    def _rest_and_free(
+        self, u: Array, kappa: Array, delay: NDArray[np.intp], start: Array, dt: float
+    ) -> tuple[Array, Array]:
+        own = self._driving(u, delay, start)
+        units, states = self._unit_runs(kappa, delay)
+        still = np.zeros((len(u), own.shape[1] - units.shape[1], units.shape[2]))
+        late = np.concatenate([own, np.concatenate([units, still], axis=1)], axis=2)
+        x = np.column_stack([start[: self.order], states])
+        y = self._response(late, kappa, dt, x)
         return y[:, :, 0], y[:, :, 1:]
 
     def estimate_initial_state(
@@ -758,21 +764,17 @@ class LPVStateSpace(VersionedPickle):
         """
         u, kappa, delay, start = self._started(u, scheduling, sampling_time, None)
         y = measured_samples(y, len(u), self.n_outputs)
-        rest, free = self.rest_and_free_responses(u, kappa, sampling_time)
+        rest, free = self._rest_and_free(u, kappa, delay, start, sampling_time)
         basis = self._basis_at(kappa[0])
         start[: self.order] = basis @ start[: self.order]
         return start + estimate_initial_state(free, y - rest, spread_of(y))
 
-    def _run(
-        self, u: Any, scheduling: Any, dt: float, initial_state: Any
-    ) -> tuple[Array, Array, Array, Array]:
-        """Inputs, scheduling, all that drives the states, and their initial ones."""
-        u, kappa, delay, start = self._started(u, scheduling, dt, initial_state)
-        n = self.order
-        late = delayed(u, delay, start[n:])
+    def _driving(self, u: Array, delay: NDArray[np.intp], start: Array) -> Array:
+        """What drives the states of a run, (n_samples, n_driving, 1)."""
+        late = delayed(u, delay, start[self.order :])
         if self.offsets is not None:
             late = np.column_stack([late, np.ones(len(u))])
-        return u, kappa, late, start[:n]
+        return late[:, :, None]
 
     def _started(
         self, u: Any, scheduling: Any, dt: float, initial_state: Any

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2 as chi_square
 
+from ..systems.least_squares import diagonal_scale
 from ..validation import real_array, squarable
 
 Array = NDArray[np.float64]
@@ -179,7 +180,7 @@ def covariance_of(information: Array) -> Array:
 
     Directions that nothing is known of count as known (minimum norm).
     """
-    size = sizes_of(information)
+    size = diagonal_scale(information)
     scaled = information / size[:, None] / size
     inverse = np.linalg.pinv(scaled, hermitian=True)
     return np.asarray(inverse / size[:, None] / size)
@@ -187,13 +188,7 @@ def covariance_of(information: Array) -> Array:
 
 def covariance_factor(covariance: Array) -> Array:
     """F of as few columns as a covariance has directions, ``F F^T`` the covariance."""
-    size = sizes_of(covariance)
+    size = diagonal_scale(covariance)
     values, vectors = np.linalg.eigh(covariance / size[:, None] / size)
     kept = values > _NO_DIRECTION * values.max(initial=0.0)
     return np.asarray(size[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
-
-
-def sizes_of(matrix: Array) -> Array:
-    """Square roots of the diagonal of an information or a covariance; 1 for zeros."""
-    size = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
-    return np.where(size > 0, size, 1.0)

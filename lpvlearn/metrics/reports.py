@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
+from ..data.experiments import OPTIONAL_ROLES, ROLES, fitted_roles
 from ..data.operating_points import mean_values
+from ..data.tables import Table
 from ..models.statespace import StateSpace
 from ..validation import number_shown, one_of, squarable
 from .scorers import (

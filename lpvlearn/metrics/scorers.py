@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.alignment import align_outputs
-from ..data.experiments import ROLES, Table, fitted_roles, read_outputs
+from ..data.experiments import ROLES, fitted_roles
 from ..data.scoring import tell_missing, warn_of_motion
+from ..data.tables import Table, read_outputs
 from ..validation import one_of, real_array, whole_number
 from .scores import Multioutput, accounted_variance, best_fit
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.alignment import beside
-from ..data.experiments import read_outputs
 from ..data.scoring import tell_missing
+from ..data.tables import read_outputs
 from ..validation import SQUARED, real_array, shown, squarable
 
 _SMALL = 1e-100  # beside larger numbers, what squares lose is nothing

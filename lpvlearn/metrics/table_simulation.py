@@ -13,11 +13,11 @@ from ..data.experiments import (
     NO_TIME,
     Experiment,
     check_inputs,
-    n_rows_of,
     naming,
     read_experiments,
 )
 from ..data.preparation import read_runs
+from ..data.tables import n_rows_of
 from ..data.timestamps import TIME_TOL
 from ..models.statespace import StateSpace
 

@@ -137,7 +137,7 @@ def foreseen_order(
     `aligned_black_boxes`; told. Of very many states, as dead times take, that is left:
     it would take minutes.
     """
-    order = local[0].order - len(local[0].integrating)
+    order = local[0].order_of_rates
     if order > _MANY or all(model.own is None for model in local):
         return None
     models, rate = _comparable(local, u, y, longest)
@@ -214,7 +214,7 @@ def balanced(local: LocalModel) -> StateSpace:
     with fast states in their place, and of what balanced truncation leaves.
     """
     rates = of_rates(local.lti, local.integrating)
-    order = local.order - len(local.integrating)
+    order = local.order_of_rates
     if rates.order <= order:
         return rates.balance()
     ways = [rates.balance(order)]

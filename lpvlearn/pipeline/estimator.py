@@ -21,13 +21,7 @@ from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
-from ..data.experiments import (
-    NO_TIME,
-    ROLES,
-    Experiment,
-    as_list,
-    read_outputs,
-)
+from ..data.experiments import NO_TIME, ROLES, Experiment
 from ..data.operating_points import (
     OperatingPoints,
     check_outputs,
@@ -37,6 +31,7 @@ from ..data.operating_points import (
     without_spikes,
 )
 from ..data.preparation import has_gaps, split_at_gaps
+from ..data.tables import as_list, read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected, retold, warn
 from ..lpv.auto import AutoLPV
@@ -62,15 +57,10 @@ from ..validation import (
     verbosity,
 )
 from .black_boxes import channel_sizes, foreseen_order
+from .common_choices import common_delay, identify_points
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
-from .local_models import (
-    LocalModel,
-    common_delay,
-    estimates_outputs,
-    identify_points,
-    tell_of_integrators,
-)
+from .local_models import LocalModel, estimates_outputs, tell_of_integrators
 from .memory import checked_memory
 from .mislabelled import tell_of_mislabelled
 from .output_error import (

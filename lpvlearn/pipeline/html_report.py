@@ -20,7 +20,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import Table
+from ..data.tables import Table
 from ..exceptions import collected
 from ..exceptions import version as own_version
 from ..inspection.bode import BodeDisplay

@@ -15,12 +15,7 @@ from joblib import Memory
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import (
-    NO_TIME,
-    Experiment,
-    naming,
-    read_outputs,
-)
+from ..data.experiments import NO_TIME, Experiment, naming
 from ..data.operating_points import (
     check_outputs,
     local_experiments,
@@ -28,6 +23,7 @@ from ..data.operating_points import (
     without_spikes,
 )
 from ..data.preparation import complete_runs, part_of
+from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected
 from ..lpv.auto import AutoLPV
@@ -64,14 +60,9 @@ from ..validation import (
 )
 from .bands import output_errors
 from .black_boxes import balanced_entries
+from .common_choices import common_delay, identify_points, of_structure
 from .error_warnings import tell_of_errors, tell_of_noisy_scheduling
-from .local_models import (
-    balanced_by_motion,
-    common_delay,
-    identify_point,
-    identify_points,
-    of_structure,
-)
+from .local_models import balanced_by_motion, identify_point
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates

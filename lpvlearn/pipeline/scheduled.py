@@ -12,9 +12,10 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.containers import OutputContainer
-from ..data.experiments import Experiment, n_rows_of, read_experiments
+from ..data.experiments import Experiment, read_experiments
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
+from ..data.tables import n_rows_of
 from ..data.timestamps import check_unit
 from ..exceptions import VersionedPickle
 from ..lpv.extrapolation import warn_extrapolation

@@ -392,7 +392,7 @@ def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
         )
     first, integrating = local[0].lti, local[0].integrating
     form = GrayBoxStructure.observable_canonical(
-        orders[0] - len(integrating),
+        local[0].order_of_rates,
         first.n_inputs,
         first.n_outputs,
         orders[0] == 0 or any(model.lti.D.any() for model in local),

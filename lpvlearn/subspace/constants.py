@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from ..systems.beginnings import moves_of, standing
-from ..systems.least_squares import column_scale
+from ..systems.least_squares import column_scale, diagonal_scale
 from ..systems.modes import (
     HARDLY_DECAYS,
     lasting,
@@ -484,8 +484,7 @@ def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
     """Chance of such a score, by the F distribution."""
     by_sample = effect.transpose(0, 2, 1, 3)
     covariance = np.tensordot(by_sample, density @ by_sample, ([0, 1, 2], [0, 1, 2]))
-    scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    scale = np.where(scale > 0, scale, 1.0)  # zero of outputs that are one signal
+    scale = diagonal_scale(covariance)  # zero of outputs that are one signal
     inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
     statistic = float((score / scale) @ inverse @ (score / scale))
     q = len(score)

@@ -18,16 +18,14 @@ from ..data.containers import OutputContainer
 from ..data.experiments import (
     OPTIONAL_ROLES,
     Experiment,
-    Table,
     as_table,
     check_inputs,
-    n_rows_of,
     naming,
     read_experiments,
-    read_outputs,
 )
 from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
 from ..data.scoring import score_from_rest
+from ..data.tables import Table, n_rows_of, read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel

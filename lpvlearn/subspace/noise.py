@@ -32,6 +32,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from ..models.innovation import InnovationModel, NoiseModel
 from ..systems.balancing import balancing_transformation
 from ..systems.innovations import covariance_root, kalman_filter
+from ..systems.least_squares import diagonal_scale
 from ..systems.response import resolvent
 from ..systems.simulation import lti_response, state_trajectory
 from .hankel import correlation_sequence
@@ -269,8 +270,7 @@ def autoregression(
         weight += float((weights**2).sum())
     lags /= weight
     # Channels of very different size must not spoil the determinants.
-    scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
-    scale[scale == 0.0] = 1.0
+    scale = diagonal_scale(lags[0])
     lags = lags / scale[:, None] / scale
     best, best_p, found = np.inf, 0, (np.zeros((ny, 0)), lags[0])
     price = ny * ny * np.log(n_samples) / n_samples

@@ -45,6 +45,7 @@ from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace, unknown_responses
 from ..systems.beginnings import moves_of
+from ..systems.least_squares import diagonal_scale
 from ..systems.simulation import (
     estimate_initial_state,
     spread_of,
@@ -405,8 +406,7 @@ def cross_correlations(
         if known:
             n_samples += len(z)
             sums[:known] += correlation_sequence(z, known)  # of t with t + lag
-    size = np.sqrt(np.diagonal(sums[0]))
-    size = np.where(size > 0.0, size, 1.0)
+    size = diagonal_scale(sums[0])
     r = sums / size[:, None] / size
     values = np.concatenate([r[:0:-1, :ny, ny:], r[:, ny:, :ny].swapaxes(1, 2)])
     lags = np.arange(-n_lags, n_lags + 1)

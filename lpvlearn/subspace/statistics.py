@@ -35,6 +35,7 @@ from ..models.statespace import (
     with_free_states,
 )
 from ..systems.innovations import covariance_root
+from ..systems.least_squares import diagonal_scale
 from ..systems.modes import spectral_radius
 from ..systems.response import resolvent
 from .criterion import criterion_of
@@ -419,9 +420,7 @@ def parameter_covariance(
             H, S = keep.T @ H @ keep, keep.T @ S @ keep
         information, score = information + H, score + S
     H, S = np.asarray(information), np.asarray(score)
-    # Rounding may leave a vanishing diagonal negative.
-    scale = np.sqrt(np.maximum(np.diagonal(H), 0.0))
-    scale[scale == 0.0] = 1.0
+    scale = diagonal_scale(H)
     values, vectors = np.linalg.eigh(H / scale[:, None] / scale)
     n_gauge = sum(block.size for block in model.blocks)
     kept = np.arange(len(values)) >= n_gauge

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.experiments import ROLES, Column, Experiment
+from ..data.experiments import ROLES, Experiment
 from ..data.preparation import (
     Pairs,
     complete_runs,
@@ -32,6 +32,7 @@ from ..data.preparation import (
     remove_trends,
     unbroken_runs,
 )
+from ..data.tables import Column
 from ..data.timestamps import (
     TIME_TOL,
     Clock,

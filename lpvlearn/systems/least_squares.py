@@ -88,6 +88,16 @@ def column_scale(M: Array) -> Array:
     return scale
 
 
+def diagonal_scale(matrix: Array) -> Array:
+    """Square roots of the diagonal of an information or a covariance; 1 for zeros.
+
+    Which rounding may leave negative.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    scale[scale == 0.0] = 1.0
+    return scale
+
+
 # Residuals (k, n_residuals) of some rows of the stack of starts, not finite where a
 # point is not admissible, and a function that gives the Jacobians (n_kept,
 # n_residuals, n_unknowns) of those of them that are kept.

@@ -17,7 +17,8 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from sklearn.utils.validation import check_is_fitted
 
 from lpvlearn import from_trajectories
-from lpvlearn.data.experiments import as_list, read_experiments, read_outputs
+from lpvlearn.data.experiments import read_experiments
+from lpvlearn.data.tables import read_outputs
 
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "t"}
 
@@ -378,18 +379,6 @@ def test_bad_trajectories_raise(trajectories, words):
         from_trajectories(trajectories)
     for word in words:
         assert re.sub(r"\s+", " ", word) in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    "names",
-    [["a", "b"], ("a", "b"), np.array(["a", "b"]), pd.Index(["a", "b"]),
-     pd.Series(["a", "b"], index=[3, 5]), pd.DataFrame(["a", "b"]),
-     np.array([["a"], ["b"]], dtype=object)],
-    ids=["list", "tuple", "array", "index", "series", "table", "column"],
-)  # fmt: skip
-def test_names_of_columns_in_any_container_are_a_list(names):
-    assert as_list(names) == ["a", "b"]
-    assert as_list("ab") == ["ab"] and as_list(None) == [] and as_list(0) == [0]
 
 
 def test_a_tuple_that_is_a_column_is_one_column():
