@@ -1,0 +1,84 @@
+"""One state more, where it explains most of what a model leaves of the outputs.
+
+A search down from one subspace model ends in the minimum that is nearest to it: where
+the inputs move seldom, as in step tests, mostly in another one than that of the best
+model of its order. A real pole `p` beside the others adds to the outputs
+
+    ``c b^T (z - p)^-1 u``,
+
+of rank one. What the best of these takes of the errors, beside all that the poles of
+the model and a feedthrough may explain, is told by the singular values of ``Q^T E``:
+`Q` is an orthonormal basis of the inputs through the pole, without what those explain,
+and `E` holds the errors, (n_samples, n_outputs). Of a grid of poles the one is taken
+that explains most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+from scipy import linalg
+
+from .records import Record
+from .residuals import of_size_one, through_modes, without
+from .simulation_fit import Freedom, Realization, simulation_errors, simulation_fit
+
+Array = NDArray[np.float64]
+
+# Time constants from one sample to twice the longest experiment
+_N_POLES, _LONGEST = 12, 2.0
+
+_KEPT = 2  # poles, of the grid
+
+_KNOWN = 1e-3  # part of the inputs through a pole that others leave, at least
+
+
+class FurtherStates:
+    """Models of records with a state more than others."""
+
+    def __init__(self, records: Sequence[Record], free: Freedom) -> None:
+        self._records, self._free = records, free
+        longest = max(record.n_samples for record in records)
+        self._poles = np.exp(-np.geomspace(1.0 / (_LONGEST * longest), 1.0, _N_POLES))
+
+    @cached_property
+    def _through(self) -> Array:
+        """Inputs through the poles, (n_samples, n_poles * n_inputs), of size one."""
+        several = [
+            [scipy.signal.lfilter([0.0, 1.0], [1.0, -p], r.u) for r in self._records]
+            for p in self._poles
+        ]
+        return of_size_one(np.vstack([np.hstack(answers) for answers in several]).T)
+
+    def beside(self, model: Realization) -> list[Realization]:
+        """The model with states that explain most, best first, not yet refined.
+
+        Nothing is beside one that is not finite.
+        """
+        errors = np.vstack(simulation_errors(model, self._records))
+        if not (np.isfinite(model.loss) and np.isfinite(errors).all()):
+            return []
+        poles, ny = np.linalg.eigvals(model.A).astype(complex), len(model.C)
+        known = [np.hstack([through_modes(poles, r.u.T), r.u.T]) for r in self._records]
+        columns = np.hstack([self._through, errors])
+        left, _ = without(of_size_one(np.vstack(known)), columns)
+        new = left[:, :-ny].T.reshape(_N_POLES, -1, len(left)).swapaxes(1, 2)
+        Q, R = np.linalg.qr(new)
+        # of poles like those of the model rounding is left
+        is_new = np.abs(np.diagonal(R, axis1=1, axis2=2)) > _KNOWN
+        parts = is_new[:, :, None] * (Q.swapaxes(1, 2) @ left[:, -ny:])
+        directions = np.linalg.svd(parts, full_matrices=False)[2][:, 0]
+        found = [
+            simulation_fit(
+                linalg.block_diag(model.A, pole),
+                np.column_stack([model.C, direction]),
+                self._records,
+                self._free,
+            )
+            for pole, direction in zip(self._poles, directions, strict=True)
+        ]
+        return sorted(found, key=lambda one: one.loss)[:_KEPT]
