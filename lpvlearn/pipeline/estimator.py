@@ -78,9 +78,11 @@ from .steps import STEPS, WITHOUT, check_step
 from .structured_models import (
     StructuredModels,
     begins_held,
+    mirror_images,
     offsets_of_points,
     over_points,
     restructure_points,
+    tell_of_mirror_images,
     with_foreseen,
     without_structure,
 )
@@ -572,6 +574,9 @@ list, default=None
                 found = best_along(ways, form, moving, self.sampling_time_)
             else:
                 found = with_foreseen(restructure_points(restructurer, *known, limit))
+                if moving:  # which tell what no point does
+                    ways, form = mirror_images(found), self._interpolator(len(points))
+                    found = best_along(ways, form, moving, self.sampling_time_)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -605,6 +610,8 @@ list, default=None
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance
+            if not moving:
+                tell_of_mirror_images(found, self.lpv_)
 
         self.refiner_ = None
         if moving:

@@ -69,6 +69,7 @@ from .stability import growth_rates
 from .steps import check_step
 from .structured_models import (
     StructuredModels,
+    mirror_images,
     over_points,
     restructure_points,
     without_structure,
@@ -512,7 +513,8 @@ class OutputErrorLPV(ScheduledEstimator):
         if structure is None:
             ways = without_structure(*known, form, every=True)
         else:
-            ways = [restructure_points(GrayBoxRestructurer(structure), *known)]
+            known_points = restructure_points(GrayBoxRestructurer(structure), *known)
+            ways = mirror_images(known_points)
         found = [_through(form, way, dt) for way in ways]
         return [replace(model, scheduling_range=bounds) for model in found]
 
@@ -664,7 +666,10 @@ def best_along(
     def loss(found: StructuredModels) -> float:
         with collected():  # is told of what is taken
             model = _through(form, found, sampling_time)
-        return squares(model, records, own, weight)
+        try:
+            return squares(model, records, own, weight)
+        except ValueError:  # it diverges: told of the best, if all do
+            return np.inf
 
     return min(ways, key=loss)
 
