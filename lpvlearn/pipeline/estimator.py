@@ -69,6 +69,7 @@ from .output_error import (
     local_covariance,
     local_output_errors,
     refine_model,
+    tell_of_missed,
 )
 from .reports import Summary, Tables, summarise, tables
 from .runner import PointRunner
@@ -795,7 +796,10 @@ list, default=None
         dt = self.sampling_time_
         known = known_coefficients(self.lpv_, found, dt)
         arguments = (self.refiner, self.lpv_, moving, dt, known)
-        refined = self.refiner_ = runner.call(refine_model, *arguments)
+        with retold() as told:
+            refined = self.refiner_ = runner.call(refine_model, *arguments)
+        if not told:
+            tell_of_missed(refined, moving, self.lpv_, found, dt)
         self.lpv_, self.interpolator_ = refined.lpv_, refined.lpv_.interpolator
         self.scheduling_range_ = np.asarray(self.lpv_.identified_range)
 

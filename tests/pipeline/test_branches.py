@@ -283,7 +283,7 @@ def coils(r1="r1", l1="l1", r2="r2", l2="l2"):
     )
 
 
-def two_coils(varies, *, n_sweeps, noise=0.01, seed=0):
+def two_coils(varies, *, n_sweeps, noise=0.01, seed=0, fast=1):
     """Tables of local experiments and sweeps, if one of the two varies, the other not.
 
     As the frozen responses are the same whichever does, the sweeps tell.
@@ -296,7 +296,7 @@ def two_coils(varies, *, n_sweeps, noise=0.01, seed=0):
     theta = np.array([values[name] for name in structure.parameter_names]).T
     truth = LPVStateSpace(structure, PolynomialLPV(1).fit(ends, theta), ends)
     rng, runs = np.random.default_rng(seed), []
-    sweep = 1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, 600))
+    sweep = 1.0 - np.cos(np.linspace(0.0, fast * 2.0 * np.pi, 600))
     for kappa in (*np.linspace(0.0, 2.0, 4), *[sweep] * n_sweeps):
         u = rng.choice([-1.0, 1.0], (200, 1)).repeat(3, axis=0)
         y = truth.simulate(u, np.broadcast_to(kappa, 600), STEP)
@@ -345,6 +345,14 @@ def test_a_guess_tells_mirror_images_apart():
     found = coils_pipeline(coils(), init=[9.0, 6.0, 0.7, 0.5])
     spread = found.fit(*two_coils(1, n_sweeps=0)).parameters_.std()
     assert spread["l1"] > 10.0 * spread["l2"]
+
+
+def test_a_refined_model_that_misses_its_own_record_is_told():
+    """As by a guess that is wrong, which no frozen model shows."""
+    pipeline = coils_pipeline(coils(), OutputErrorLPV(), init=[9.0, 6.0, 0.7, 0.5])
+    pipeline.fit(*two_coils(1, n_sweeps=1, noise=0.1))  # a warning would be an error
+    with pytest.warns(UserWarning, match="refined model misses .* in the experiments"):
+        pipeline.fit(*two_coils(2, n_sweeps=1, fast=8))
 
 
 def test_parts_that_are_the_same_at_all_points_have_no_mirror_image():
