@@ -304,6 +304,9 @@ def _images(
 
 def tell_of_mirror_images(found: StructuredModels, model: LPVStateSpace) -> None:
     """Tell of parts whose interchange is another LPV model of the same responses."""
+    q = found.structure.n_params
+    if any(fitted.identifiability_.rank < q for fitted in found.restructurers):
+        return  # these are told
     family = model.silenced().parameters(found.points.kappa)
     places, change = _images(found, family)
     if not (change > _TOLD).any():

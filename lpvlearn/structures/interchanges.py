@@ -45,6 +45,7 @@ _AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times a rate of
 _OUTSIDE = 1e3  # weight of what lies outside of a range
 _RATES = 1e-12  # those of A relative to its size that are not zero
 _SLOWEST = 1e-3  # rate at which what is remembered fades at least, of the fastest one
+_WIDE, _GRID = 10.0, 60  # beyond the rates of a model, and frequencies to look at
 _PLACES = 12  # operating points that are compared at most
 
 
@@ -168,6 +169,27 @@ def _interchanges(
             if (np.abs(_response(structure, theta[pi]) - here) <= most).all()
         ]
     return np.array(found) if found else nothing
+
+
+def slow_first(structure: GrayBoxStructure, family: Array, places: Places) -> Array:
+    """How far interchanges (k, n_params) bring slower parts to earlier parameters, (k,)
+
+    Where in frequency (logarithm, a mean over `family`) the response shows a parameter,
+    times its number: of two modes the slower one is the first.
+    """
+    n, q = structure.order, structure.n_params
+    center = np.zeros(q)
+    for theta in family:
+        rates = np.abs(np.linalg.eigvals(structure.system_matrix(theta)[:n, :n]))
+        rates = rates[rates > _RATES * rates.max(initial=0.0)]
+        if rates.size:
+            omega = np.geomspace(rates.min() / _WIDE, rates.max() * _WIDE, _GRID)
+            slopes = _slopes(structure, theta, 1j * omega).reshape(q, _GRID, -1)
+            power = (np.abs(slopes) ** 2).sum(2)
+            total = power.sum(1)
+            mean = power @ np.log(omega) / np.where(total > 0.0, total, 1.0)
+            center += np.where(np.isfinite(mean), mean, 0.0)
+    return np.asarray(center[places] @ np.arange(q))
 
 
 def _fading(S: Array, n: int) -> tuple[Array, Array, Array]:

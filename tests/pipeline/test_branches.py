@@ -190,11 +190,8 @@ def test_modes_keep_their_places_between_points(seed, efficient):
         P = pipeline.parameters_covariance_[k]
         np.testing.assert_allclose(np.diag(P), pipeline.parameters_std_.iloc[k] ** 2)
     order = pipeline.parameters_[["w2_1", "w2_2"]].to_numpy().argsort(1)
-    assert (order == order[0]).all()
-    slow, fast = order[0] + 1
-    ratio = (
-        pipeline.parameters_std_[f"w2_{fast}"] / pipeline.parameters_std_[f"w2_{slow}"]
-    )
+    assert (order == [0, 1]).all()  # the slow one is the first, whatever the seed
+    ratio = pipeline.parameters_std_["w2_2"] / pipeline.parameters_std_["w2_1"]
     assert (ratio > 1.0).all()  # standard deviations stay with their modes
 
 

@@ -12,6 +12,7 @@ from lpvlearn.structures.interchanges import (
     exchangeable,
     interchanges,
     known_before,
+    slow_first,
     told_by_motion,
 )
 
@@ -193,3 +194,20 @@ def test_units_of_channels_and_integrators_do_not_change_what_motion_tells(units
         assert found[1] > 0.1
         again = told_by_motion(scaled, family, places)
         np.testing.assert_allclose(again, found, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
+def test_the_slower_parts_come_first(scale):
+    """Whatever their gains, and in whichever order they are."""
+    structure = GrayBoxStructure.modal(3)
+    rng = np.random.default_rng(3)
+    theta = dict(zip(structure.parameter_names, rng.normal(size=12), strict=True))
+    for k in range(3):
+        rate = scale * 2.0**k
+        theta |= {f"d_{k + 1}": 0.1 * rate, f"w2_{k + 1}": rate**2}
+    row = structure.check_params(theta)
+    places = interchanges(structure)
+    assert len(places) == 6
+    for pi in places:
+        best = places[np.argmax(slow_first(structure, row[pi][None], places))]
+        np.testing.assert_array_equal(row[pi][best], row)
