@@ -51,6 +51,8 @@ REMEDIES = {
     "left out …": "The point is missing in the LPV model, which interpolates over it. "
     "Mend what the message names, or measure there again.",
     "the parameters … may have changed places": "See :ref:`guide_restructuring`.",
+    "the values of … may be those of one another at all operating points": "See "
+    ":ref:`guide_restructuring`.",
     "inputs or outputs stand away from zero": "See :ref:`guide_points_of_work`.",
     "the structure comes no nearer": "Compare the responses by ``BodeDisplay``: where "
     "they part, the structure lacks something, or the black box is wrong.",

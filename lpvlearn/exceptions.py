@@ -88,6 +88,13 @@ def retold() -> Iterator[list[Told]]:
             warn(message, category)
 
 
+def take_back(words: str) -> None:
+    """Drop warnings that hold these words, of those that were not given yet."""
+    collecting = _COLLECTING.get()
+    if collecting is not None:
+        collecting[:] = [told for told in collecting if words not in told.message]
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Give a warning that points to the user's line, however deep it arises.
 

@@ -10,7 +10,13 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from lpvlearn import LocalLPVPipeline, PolynomialLPV, SubspaceLTI
-from lpvlearn.exceptions import ExtrapolationWarning, RankWarning
+from lpvlearn.exceptions import (
+    ExtrapolationWarning,
+    RankWarning,
+    collected,
+    take_back,
+    warn,
+)
 
 
 def collinear():
@@ -83,3 +89,12 @@ def test_tables_of_a_pickled_estimator_stay_what_they_are(table):
     fitted.table_ = table
     back = pickle.loads(pickle.dumps(fitted))
     pd.testing.assert_frame_equal(back.table_, table)
+
+
+def test_what_is_known_better_later_is_taken_back():
+    take_back("never told")
+    with collected() as told:
+        warn("one thing may be another one")
+        warn("the sky falls")
+        take_back("may be another")
+    assert [message for message, _ in told] == ["the sky falls"]

@@ -116,6 +116,15 @@ restructurer.starts_
 # such values, which are told. ``with_ranges``, ``with_bounds`` or a first guess decide
 # which part has which number, and which family is taken.
 #
+# Parts of *all* points may be interchanged. Of modes side by side that is a matter of
+# names: their states change places in the same way everywhere. Of parts in series, as
+# the two coils of a filter of which one varies, the states are scaled anew by every
+# value of the scheduling variable, and where it moves the mirror image is another LPV
+# model. No local experiment tells them apart; experiments that move do: with a
+# ``refiner`` the pipeline begins at the one that simulates these best. Without such
+# experiments it warns, where what inputs leave behind at one end of the range would
+# differ at the other one by a fifth.
+#
 # Two parts that noise has merged at a point have no places at all: the parameters there
 # are any, with infinite covariance, and no smooth function goes through them. Then the
 # polynomial is fitted to the black boxes of all points together, each in the

@@ -456,7 +456,8 @@ def local_prior(
         if not records:  # it tells nothing
             continue
         constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
-        local = replace(model.silenced(), interpolator=constant, bases=())
+        quiet = model.silenced()
+        local = replace(quiet, interpolator=constant, bases=(), covariance=None)
         found = [simulated(local, record, own) for record in records]
         weight = 1.0 / _remaining(found, _sizes(records))
         H = sum(

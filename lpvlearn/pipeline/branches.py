@@ -27,7 +27,12 @@ from scipy.spatial.distance import cdist
 from ..lpv.alignment import spanning_tree
 from ..models.scheduling_range import in_range_of_points
 from ..restructuring.problem import RestructuringProblem
-from ..structures.interchanges import distance, interchanges, known_before
+from ..structures.interchanges import (
+    distance,
+    interchanges,
+    known_before,
+    slow_first,
+)
 from ..structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
@@ -123,8 +128,7 @@ def tied_branches(
         kappa, candidates, variances, n_first, far, places
     )
     family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
-    own = np.array([found[0] for found in optima])
-    number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own, far)]
+    number = places[_numbering(structure, family, places, far)]
     branches = []
     for found, origin, i, lower in zip(optima, origins, chosen, lower_fit, strict=True):
         optimum, pi = origin[i]
@@ -216,15 +220,18 @@ def _exchanges(
 
 
 def _numbering(
-    structure: GrayBoxStructure, images: Array, own: Array, far: Distance | None
+    structure: GrayBoxStructure, family: Array, places: Choices, far: Distance | None
 ) -> int:
     """Which image of the whole family to keep: the least `far` from what is known.
 
-    Else the one that leaves most points as they are.
+    Else, and of those as far, the one whose earlier parts are the slower ones.
     """
+    images = family[:, places].swapaxes(0, 1)
     inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
-    merit = (images == own).all(2).sum(1) if far is None else -far(images)
-    return int(np.argmax(np.where(inside, merit, -np.inf)))
+    away = np.where(inside, 0.0 if far is None else far(images), np.inf)
+    near = np.isclose(away, away.min())
+    merit = slow_first(structure, family, places)
+    return int(np.argmax(np.where(near, merit, -np.inf)))
 
 
 def smoothest_family(

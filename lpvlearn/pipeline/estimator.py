@@ -69,6 +69,7 @@ from .output_error import (
     local_covariance,
     local_output_errors,
     refine_model,
+    tell_of_missed,
 )
 from .reports import Summary, Tables, summarise, tables
 from .runner import PointRunner
@@ -78,9 +79,11 @@ from .steps import STEPS, WITHOUT, check_step
 from .structured_models import (
     StructuredModels,
     begins_held,
+    mirror_images,
     offsets_of_points,
     over_points,
     restructure_points,
+    tell_of_mirror_images,
     with_foreseen,
     without_structure,
 )
@@ -572,6 +575,9 @@ list, default=None
                 found = best_along(ways, form, moving, self.sampling_time_)
             else:
                 found = with_foreseen(restructure_points(restructurer, *known, limit))
+                if moving:  # which tell what no point does
+                    ways, form = mirror_images(found), self._interpolator(len(points))
+                    found = best_along(ways, form, moving, self.sampling_time_)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -605,6 +611,8 @@ list, default=None
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance
+            if not moving:
+                tell_of_mirror_images(found, self.lpv_)
 
         self.refiner_ = None
         if moving:
@@ -788,7 +796,10 @@ list, default=None
         dt = self.sampling_time_
         known = known_coefficients(self.lpv_, found, dt)
         arguments = (self.refiner, self.lpv_, moving, dt, known)
-        refined = self.refiner_ = runner.call(refine_model, *arguments)
+        with retold() as told:
+            refined = self.refiner_ = runner.call(refine_model, *arguments)
+        if not told:
+            tell_of_missed(refined, moving, self.lpv_, found, dt)
         self.lpv_, self.interpolator_ = refined.lpv_, refined.lpv_.interpolator
         self.scheduling_range_ = np.asarray(self.lpv_.identified_range)
 

@@ -25,9 +25,9 @@ from ..data.operating_points import (
 from ..data.preparation import complete_runs, part_of
 from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing, collected
+from ..exceptions import all_or_nothing, collected, warn
 from ..lpv.auto import AutoLPV
-from ..lpv.bands import left_out_errors
+from ..lpv.bands import left_out_errors, levels_of
 from ..lpv.interpolator import Interpolator
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
@@ -69,6 +69,7 @@ from .stability import growth_rates
 from .steps import check_step
 from .structured_models import (
     StructuredModels,
+    mirror_images,
     over_points,
     restructure_points,
     without_structure,
@@ -91,6 +92,10 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 _LOOKED_AT = 4  # experiments of an operating point: more tell the same of the errors
 
 _FEWEST_POINTS = 3  # at which experiments stay, of a model through these
+
+# Errors of a refined model along its own experiments that are told: relative to the
+# outputs, and to those of the start along the local ones
+_MISSED, _MORE = 0.2, 3.0
 
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
@@ -512,7 +517,8 @@ class OutputErrorLPV(ScheduledEstimator):
         if structure is None:
             ways = without_structure(*known, form, every=True)
         else:
-            ways = [restructure_points(GrayBoxRestructurer(structure), *known)]
+            known_points = restructure_points(GrayBoxRestructurer(structure), *known)
+            ways = mirror_images(known_points)
         found = [_through(form, way, dt) for way in ways]
         return [replace(model, scheduling_range=bounds) for model in found]
 
@@ -664,7 +670,10 @@ def best_along(
     def loss(found: StructuredModels) -> float:
         with collected():  # is told of what is taken
             model = _through(form, found, sampling_time)
-        return squares(model, records, own, weight)
+        try:
+            return squares(model, records, own, weight)
+        except ValueError:  # it diverges: told of the best, if all do
+            return np.inf
 
     return min(ways, key=loss)
 
@@ -700,6 +709,55 @@ def local_output_errors(
     except ValueError:  # it diverges, or has no matrices there
         errors = [np.full((1, model.n_outputs), np.nan)]
     return output_errors(names, errors)
+
+
+def tell_of_missed(
+    refined: Any,
+    experiments: Sequence[Experiment],
+    start: LPVStateSpace,
+    found: StructuredModels,
+    sampling_time: float,
+) -> None:
+    """Tell of a refined model that misses what it was refined on, but not the points.
+
+    By the part of its errors that is no white noise, relative to how far outputs move,
+    and by that of the `start` along the local experiments.
+    """
+    own = Own(
+        getattr(refined, "initial_state", "estimate") == "estimate",
+        getattr(refined, "offset", None) == "constant",
+    )
+    some = [e for group in found.points.experiments for e in group[:_LOOKED_AT]]
+    try:
+        missed = _missed(refined.lpv_, experiments, own, sampling_time)
+        there = _missed(start, some, _own_of_local(found), sampling_time)
+    except ValueError:  # it diverges: told elsewhere
+        return
+    bad = (missed > _MISSED) & (missed > _MORE * there)
+    if bad.any():
+        i = int(np.argmax(np.where(bad, missed, 0.0)))
+        names = start.output_names or range(1, start.n_outputs + 1)
+        warn(
+            f"the refined model misses {100.0 * missed[i]:.2g} % of output "
+            f"{names[i]!r} in the experiments that move, on which it was refined; of "
+            f"the local ones that of the points misses {100.0 * there[i]:.2g} %. "
+            "Either parts of the structure stand in each other's place, which no "
+            "frozen model shows, or it lacks what moves with the scheduling variables, "
+            "or these experiments have another disturbance. Check bounds and guesses "
+            "(`init`), what the experiments were, and the fit of each, "
+            "`refiner_.report_`; give a `restructurer` of another structure, or "
+            "rate=True."
+        )
+
+
+def _missed(
+    model: LPVStateSpace, experiments: Sequence[Experiment], own: Own, dt: float
+) -> Array:
+    """Errors that are no white noise, relative to how far outputs move."""
+    records, quiet = [_record(e, dt) for e in experiments], model.silenced()
+    pairs = zip(experiments, records, strict=True)
+    errors = [_errors(quiet, e, record, own) for e, record in pairs]
+    return np.asarray(levels_of(errors).model_error * weights_of(records))
 
 
 def _held(record: Record) -> Record:

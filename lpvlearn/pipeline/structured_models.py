@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, retold, warn
+from ..exceptions import collected, retold, take_back, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
 from ..lpv.left_out import interpolated_without, takes_covariance, values_left_out
@@ -28,6 +28,12 @@ from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
+from ..structures.interchanges import (
+    as_plausible,
+    interchanges,
+    known_before,
+    told_by_motion,
+)
 from ..structures.structure import GrayBoxStructure
 from ..systems.beginnings import Beginning, begin_held, waiting
 from .black_boxes import (
@@ -58,6 +64,13 @@ _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
 # there that are foreseen elsewhere: by so many times what is usual, up to which error
 _UNTOLD, _FORESEEING = 10.0, 4
 _ASTRAY, _LIKE = 5.0, 0.01
+
+# Change of what is remembered after a jump over the range from which an interchange is
+# another LPV model, and is told of (in fast sweeps the outputs then miss by a tenth);
+# and interchanges that are compared along experiments at most
+_ANOTHER, _TOLD = 0.01, 0.2
+_IMAGES = 24
+_OF_A_POINT = "no response tells these parts of the structure apart"  # the warning
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -241,6 +254,75 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
             "tell. Give values or bounds of these parameters if they are known."
         )
     return found._replace(theta=theta, covariance=covariance, models=models)
+
+
+def mirror_images(found: StructuredModels) -> list[StructuredModels]:
+    """The models, and those with parts interchanged at all points, if others over them.
+
+    These have the same responses at every point, and nothing known before tells them
+    apart; where the scheduling variables move they differ. Takes back what was told of
+    that at the points.
+    """
+    mirrored, others = [found], _images(found)[0]
+    if len(others):
+        take_back(_OF_A_POINT)
+    for places in others:
+        theta = found.theta[:, places]
+        models = _delayed(found.structure, theta, found.local)
+        covariance = found.covariance[:, places[:, None], places]
+        fits = [fitted.interchanged(places) for fitted in found.restructurers]
+        mirrored.append(
+            found._replace(
+                theta=theta, covariance=covariance, models=models, restructurers=fits
+            )
+        )
+    return mirrored
+
+
+def _images(
+    found: StructuredModels, family: Array | None = None
+) -> tuple[NDArray[np.intp], Array]:
+    """Interchanges that make another LPV model, and how much: the most first."""
+    structure, fits = found.structure, found.restructurers
+    none = np.zeros((0, structure.n_params), dtype=np.intp), np.zeros(0)
+    if len(found.theta) < 2 or not all(hasattr(f, "interchanged") for f in fits):
+        return none
+    places = interchanges(structure) if fits else none[0]
+    if len(places) < 2:
+        return none
+    theta = found.theta if family is None else family
+    known = known_before(structure, getattr(fits[0], "init", None))
+    places = places[as_plausible(structure, theta, places, known)][:_IMAGES]
+    try:
+        change = told_by_motion(structure, theta, places)
+    except (ValueError, np.linalg.LinAlgError):  # no such model, or no Gramians
+        return none
+    order = np.argsort(-change, kind="stable")
+    order = order[change[order] > _ANOTHER]
+    return places[order], change[order]
+
+
+def tell_of_mirror_images(found: StructuredModels, model: LPVStateSpace) -> None:
+    """Tell of parts whose interchange is another LPV model of the same responses."""
+    q = found.structure.n_params
+    if any(fitted.identifiability_.rank < q for fitted in found.restructurers):
+        return  # these are told
+    family = model.silenced().parameters(found.points.kappa)
+    places, change = _images(found, family)
+    if not (change > _TOLD).any():
+        return
+    take_back(_OF_A_POINT)
+    moved = (places[change > _TOLD] != np.arange(places.shape[1])).any(axis=0)
+    names = [found.structure.parameter_names[j] for j in np.flatnonzero(moved)]
+    warn(
+        f"the values of {', '.join(map(repr, names))} may be those of one another at "
+        "all operating points: no response there tells these parts of the structure "
+        "apart, but where the scheduling variables move they make another LPV model, "
+        "and this one may be wrong. Give experiments that move, with refiner="
+        "OutputErrorLPV(), which decide; or say which is which by "
+        "structure.with_bounds(), structure.with_ranges(), or a first guess, "
+        "GrayBoxRestructurer(structure, init=...)."
+    )
 
 
 def without_structure(

@@ -10,6 +10,13 @@ response there,
 It is an automorphism of the graph whose vertices and edges have these values for
 colours. A search with backtracking finds them all; which of them hold elsewhere, too,
 random parameters tell.
+
+Where theta follows a scheduling variable they may be told apart. The states of G(theta)
+and G(pi theta) are related by a matrix T(theta). If it is the same at all points, the
+LPV model is one model, as of modes of which one is called the first. Else a state that
+is carried from one point to the next becomes another one: what inputs at a point i do
+to the outputs at a point k, the product of the observability operator there and the
+controllability operator here, is ``O_k T_k^-1 T_i C_i`` in place of ``O_k C_i``.
 """
 
 from __future__ import annotations
@@ -19,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_sylvester
 
 if TYPE_CHECKING:
     from .structure import GrayBoxStructure
@@ -36,6 +44,9 @@ _STEPS = 50_000  # of the search, after which the rest is left out
 _AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times a rate of A
 _OUTSIDE = 1e3  # weight of what lies outside of a range
 _RATES = 1e-12  # those of A relative to its size that are not zero
+_SLOWEST = 1e-3  # rate at which what is remembered fades at least, of the fastest one
+_WIDE, _GRID = 10.0, 60  # beyond the rates of a model, and frequencies to look at
+_PLACES = 12  # operating points that are compared at most
 
 
 def interchanges(structure: GrayBoxStructure) -> Places:
@@ -70,6 +81,45 @@ def exchangeable(structure: GrayBoxStructure, theta: Array, guess: Array) -> lis
     far = distance(structure, images[:, None], guess)
     moved = (images != theta) & (inside & np.isclose(far, far[0]))[:, None]
     return [structure.parameter_names[j] for j in np.flatnonzero(moved.any(0))]
+
+
+def as_plausible(
+    structure: GrayBoxStructure, family: Array, places: Places, guess: Array
+) -> NDArray[np.bool_]:
+    """Which of `places` (k, n_params) bounds and `guess` tell from none of the others.
+
+    Of the parameters at all points, `family` (n_points, n_params), as they are.
+    """
+    images = family[:, places].swapaxes(0, 1)
+    far = distance(structure, images, guess)
+    within = (images >= structure.lower) & (images <= structure.upper)
+    return np.asarray(within.all((1, 2)) & np.isclose(far, far[0]))
+
+
+def told_by_motion(structure: GrayBoxStructure, family: Array, places: Places) -> Array:
+    """How much interchanges change what one point remembers of another one, (k,).
+
+    The largest over the points of `family` (n_points, n_params): difference of the
+    operators from past inputs to outputs after a jump, relative to them, in the
+    Hilbert-Schmidt norm. Zero for changes of the states that are the same everywhere.
+    """
+    n = structure.order
+    few = np.linspace(0, len(family) - 1, min(len(family), _PLACES)).round().astype(int)
+    family = family[few]
+    size = _channel_sizes(structure.system_matrix(family[len(family) // 2]), n)
+    own = [_fading(structure.system_matrix(row) / size, n) for row in family]
+    before = _energies(own, own)
+    change = np.zeros(len(places))
+    for i, pi in enumerate(places):
+        if (family[:, pi] == family).all():
+            continue
+        other = [_fading(structure.system_matrix(row[pi]) / size, n) for row in family]
+        after, across = _energies(other, other), _energies(own, other)
+        most = np.maximum(before, after)
+        gap = before + after - 2.0 * across
+        gap = np.divide(gap, most, out=np.zeros_like(gap), where=most > 0.0)
+        change[i] = np.sqrt(max(float(gap.max()), 0.0))
+    return change
 
 
 def known_before(structure: GrayBoxStructure, init: Any) -> Array:
@@ -119,6 +169,56 @@ def _interchanges(
             if (np.abs(_response(structure, theta[pi]) - here) <= most).all()
         ]
     return np.array(found) if found else nothing
+
+
+def slow_first(structure: GrayBoxStructure, family: Array, places: Places) -> Array:
+    """How far interchanges (k, n_params) bring slower parts to earlier parameters, (k,)
+
+    Where in frequency (logarithm, a mean over `family`) the response shows a parameter,
+    times its number: of two modes the slower one is the first.
+    """
+    n, q = structure.order, structure.n_params
+    center = np.zeros(q)
+    for theta in family:
+        rates = np.abs(np.linalg.eigvals(structure.system_matrix(theta)[:n, :n]))
+        rates = rates[rates > _RATES * rates.max(initial=0.0)]
+        if rates.size:
+            omega = np.geomspace(rates.min() / _WIDE, rates.max() * _WIDE, _GRID)
+            slopes = _slopes(structure, theta, 1j * omega).reshape(q, _GRID, -1)
+            power = (np.abs(slopes) ** 2).sum(2)
+            total = power.sum(1)
+            mean = power @ np.log(omega) / np.where(total > 0.0, total, 1.0)
+            center += np.where(np.isfinite(mean), mean, 0.0)
+    return np.asarray(center[places] @ np.arange(q))
+
+
+def _fading(S: Array, n: int) -> tuple[Array, Array, Array]:
+    """A, B, C; A shifted so that the Gramians exist, which changes no T."""
+    poles = np.linalg.eigvals(S[:n, :n])
+    slowest = poles.real.max(initial=-np.inf) + _SLOWEST * np.abs(poles).max(initial=0)
+    return S[:n, :n] - max(slowest, 0.0) * np.eye(n), S[:n, n:], S[n:, :n]
+
+
+def _channel_sizes(S: Array, n: int) -> Array:
+    """What brings a system matrix to inputs and outputs of like sizes, by division."""
+    A, B, C = _fading(S, n)
+    rows, columns = np.ones(S.shape[0]), np.ones(S.shape[1])
+    moved = np.einsum("ij,jk,ik->i", C, solve_sylvester(A, A.T, -B @ B.T), C)
+    rows[n:] = np.sqrt(np.where(moved > 0.0, moved, 1.0))
+    C = C / rows[n:, None]
+    moves = np.einsum("ji,jk,ki->i", B, solve_sylvester(A.T, A, -C.T @ C), B)
+    columns[n:] = np.sqrt(np.where(moves > 0.0, moves, 1.0))
+    return rows[:, None] * columns
+
+
+def _energies(
+    one: list[tuple[Array, Array, Array]], other: list[tuple[Array, Array, Array]]
+) -> Array:
+    """``<O_k C_i, O'_k C'_i>`` of two families of models for all k, i."""
+    pairs = list(zip(one, other, strict=True))
+    X = [solve_sylvester(A.T, F, -C.T @ H) for (A, _, C), (F, _, H) in pairs]
+    Y = [solve_sylvester(F, A.T, -G @ B.T) for (A, B, _), (F, G, _) in pairs]
+    return np.einsum("kab,iba->ki", np.array(X), np.array(Y))
 
 
 def _frequencies(S: Array, order: int) -> Complex:

@@ -293,6 +293,15 @@ def test_an_operating_point_without_records_tells_nothing():
     np.testing.assert_array_equal(none, np.zeros_like(one))
 
 
+def test_a_covariance_of_the_coefficients_does_not_matter_to_what_records_tell():
+    """Its size is that of the form, not of the constants at a point."""
+    truth, points = spring_lpv(), np.array([[0.0], [1.0]])
+    own, theta = [[record(truth)]] * 2, truth.parameters(points)
+    told = replace(truth, covariance=np.eye(len(coefficients_of(truth))))
+    known, again = (local_prior(m, points, theta, own, MOVING) for m in (truth, told))
+    np.testing.assert_array_equal(again.information, known.information)
+
+
 @pytest.mark.slow
 def test_experiments_in_parallel_are_the_same():
     truth = spring_lpv()

@@ -4,6 +4,7 @@ from math import factorial
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from lpvlearn import GrayBoxStructure
 from lpvlearn.structures.interchanges import (
@@ -11,6 +12,8 @@ from lpvlearn.structures.interchanges import (
     exchangeable,
     interchanges,
     known_before,
+    slow_first,
+    told_by_motion,
 )
 
 LAGS = GrayBoxStructure.from_template(
@@ -126,3 +129,85 @@ def test_slow_parameters_beside_fast_poles_are_told_apart():
         [[0, 1, 0], [0, "-a", "a"], [0, 0, -1e8]], [[0], [0], ["b"]], [[1, 0, 0]]
     )
     assert len(interchanges(fast)) == 1
+
+
+def along(structure, low, high, n_points=5):
+    return np.linspace(structure.check_params(low), structure.check_params(high), 5)
+
+
+@pytest.mark.parametrize("structure", [GrayBoxStructure.modal(3), TWINS])
+def test_the_order_of_parts_side_by_side_is_no_other_model(structure):
+    low, high = np.exp(np.random.default_rng(1).normal(size=(2, structure.n_params)))
+    places = interchanges(structure)
+    change = told_by_motion(structure, np.linspace(low, high, 5), places)
+    np.testing.assert_allclose(change, 0.0, atol=1e-6)
+
+
+def test_the_order_of_parts_in_series_is_another_model_if_one_varies():
+    theta = {"actuator": 1.0, "sensor": 2.0, "gain": 1.0}
+    places = interchanges(servo())
+
+    def change(**high):
+        return told_by_motion(servo(), along(servo(), theta, theta | high), places)[1]
+
+    assert change() == 0.0
+    assert change(gain=9.0) < 1e-6
+    assert 0.2 < change(sensor=4.0) < change(sensor=9.0) < 1.0
+    assert change(actuator=2.0) > 0.1
+
+
+def test_how_much_motion_tells_is_the_difference_after_a_jump():
+    """By simulation: impulses before it, the responses behind it."""
+    family = np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 9.0]])
+    places = interchanges(servo())
+    times = np.arange(0.0, 20.0, 0.02) + 0.01
+
+    def responses(pi, jump):
+        a, b = (servo().model(row[pi]) for row in family[jump])
+        before = [expm(a.A * t) @ a.B for t in times]
+        after = np.vstack([b.C @ expm(b.A * t) for t in times])
+        return after @ np.hstack(before)
+
+    expected = []
+    for jump in ([0, 1], [1, 0]):
+        one, other = (responses(pi, jump) for pi in places)
+        size = max(np.linalg.norm(one), np.linalg.norm(other))
+        expected.append(np.linalg.norm(one - other) / size)
+    found = told_by_motion(servo(), family, places)
+    np.testing.assert_allclose(found, [0.0, max(expected)], rtol=0.02)
+
+
+@pytest.mark.parametrize("units", [1e-6, 1e6])
+def test_units_of_channels_and_integrators_do_not_change_what_motion_tells(units):
+    def structure(unit, pole):
+        return GrayBoxStructure.from_template(
+            [["-a", 0, 0], [1, "-b", 0], [0, 1, pole]],
+            [[unit], [0], [0]],
+            [[0, unit, 0], [0, 0, 1]],
+        )
+
+    low, high = {"a": 1.0, "b": 2.0}, {"a": 1.0, "b": 6.0}
+    for pole in (0, -0.1, 0.1):
+        plain, scaled = (structure(unit, pole) for unit in (1.0, units))
+        places, family = interchanges(plain), along(plain, low, high)
+        found = told_by_motion(plain, family, places)
+        assert found[1] > 0.1
+        again = told_by_motion(scaled, family, places)
+        np.testing.assert_allclose(again, found, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
+def test_the_slower_parts_come_first(scale):
+    """Whatever their gains, and in whichever order they are."""
+    structure = GrayBoxStructure.modal(3)
+    rng = np.random.default_rng(3)
+    theta = dict(zip(structure.parameter_names, rng.normal(size=12), strict=True))
+    for k in range(3):
+        rate = scale * 2.0**k
+        theta |= {f"d_{k + 1}": 0.1 * rate, f"w2_{k + 1}": rate**2}
+    row = structure.check_params(theta)
+    places = interchanges(structure)
+    assert len(places) == 6
+    for pi in places:
+        best = places[np.argmax(slow_first(structure, row[pi][None], places))]
+        np.testing.assert_array_equal(row[pi][best], row)
