@@ -321,6 +321,8 @@ display = BodeDisplay.from_models(
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample can be told apart where
 #   the reference moves by steps, as "auto" does, but not where signals are Gaussian.
+#   Parts held out, which "auto" asks then, tell little where disturbances move the loop
+#   more than the reference does.
 # * A loop that only disturbances move, about a set-point that stays, tells the
 #   controller and not the plant: every input follows from the outputs, exactly, and the
 #   model is the controller, inverted. A warning says so where the controller is a P, PI

@@ -97,6 +97,19 @@ def test_the_fit_tells_that_the_model_is_the_controllers(options, digits):
     assert sum("closed loop" in t for t in texts) == 0
 
 
+def test_parts_that_a_disturbance_moves_are_said_to_tell_little():
+    rng, n = np.random.default_rng(0), 1500
+    u, y, x = np.zeros(n), np.zeros(n), 0.0
+    w, e, v = rng.standard_normal((3, n)) * [[0.5], [0.05], [0.3]]
+    for t in range(n):
+        y[t] = x + e[t]
+        u[t] = v[t] - 2.0 * y[t] - 0.05 * y[:t].sum()
+        x = 0.95 * x + 0.1 * (u[t] + w[t])
+    text = "use method='pbsid', feedthrough=False.*Parts held out hardly tell"
+    with pytest.warns(UserWarning, match=text):
+        SubspaceLTI().fit(u[:, None], y[:, None])
+
+
 @pytest.mark.parametrize("n_samples", [150, 300, 1000])
 def test_a_white_input_of_few_samples_is_designed(n_samples):
     for seed in range(20):
