@@ -321,10 +321,17 @@ display = BodeDisplay.from_models(
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample can be told apart where
 #   the reference moves by steps, as "auto" does, but not where signals are Gaussian.
-# * The warning may be false where channels are not sampled at once: outputs that are
-#   means over the sample to come know the next inputs, too. "auto" then leaves D free,
-#   or takes ``"po-moesp"``, where parts held out speak clearly for it, and says both
-#   figures. Give the outputs a sample later if that is what happened.
+#   Parts held out, which "auto" asks then, tell little where disturbances move the loop
+#   more than the reference does.
+# * A loop that only disturbances move, about a set-point that stays, tells the
+#   controller and not the plant: every input follows from the outputs, exactly, and the
+#   model is the controller, inverted. A warning says so where the controller is a P, PI
+#   or PID one, or answers a sample later. Let the set-point move by random steps, or
+#   add noise to the input.
+# * That of feedback may be false where channels are not sampled at once: outputs that
+#   are means over the sample to come know the next inputs, too. "auto" then leaves D
+#   free, or takes ``"po-moesp"``, where parts held out speak clearly for it, and says
+#   both figures. Give the outputs a sample later if that is what happened.
 # * Outputs that lead the inputs by several samples, as clocks that differ or filters of
 #   the inputs alone make them, know what is to come as well. If later inputs explain
 #   parts held out ten times better (squared errors), a warning says how much later.

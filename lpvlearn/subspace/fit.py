@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import check_excitation, remove_trends
+from .answers import tell_of_answering_input
 from .at_rest import from_rest, moved_back
 from .cross_checks import tell_of_contradiction, tell_of_input_spikes
 from .drift import of_drifting_noise
@@ -119,10 +120,13 @@ def _tell_of_loop(
     samples: Samples, fitted: LocalFit, doubt: Doubt | None, like: LocalFit | None
 ) -> None:
     """Tell where inputs answer the outputs, or seem to."""
-    _, choices, telling = samples
+    pairs, choices, telling = samples
     feedback = fitted.feedback
     if feedback is None:
         return
+    if not (choices.estimated or choices.differences or "feedback" in telling):
+        if tell_of_answering_input(pairs, telling):
+            return
     if feedback.found and "feedback" not in telling:
         if feedback.shown or not fitted.model.D.any():
             tell_of_feedback(feedback, fitted, choices, doubt, telling)

@@ -67,6 +67,9 @@ _HALF = 0.5  # share of their energy that enforced stability must cost to be rep
 # 200 samples at equal noise and signal a right model comes to two thirds.
 _CONFIRMED = 0.5
 
+# Best fit of parts held out, percent, that leaves half their energy
+_HALF_EXPLAINED = 29.3
+
 _NOTHING = 1.0  # best fit of parts held out, percent, that is none
 
 _DECAYS = 2.0  # standard deviations of a pole, from which its decay is known
@@ -285,6 +288,12 @@ def tell_of_feedback(
             f"{'' if open_loop else ' without a delay of a sample'}, use "
             f"method='pbsid'{', feedthrough=False' if loop else ''}."
         )
+        if loop and not open_loop and doubt.bft_taken < _HALF_EXPLAINED:
+            what += (
+                " Parts held out hardly tell: neither simulates them, as where "
+                "disturbances move the loop more than what is added to it. Check which "
+                "is known of the plant, or let the reference move more."
+            )
     else:
         what += "method='pbsid' was taken, which that does not bias."
         if loop:
