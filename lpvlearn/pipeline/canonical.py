@@ -81,7 +81,8 @@ def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None
     around = []
     for model in local:
         deviated = [m for pair in model.deviated() for m in pair]
-        if not deviated:
+        # one with a pole beyond zero has more states in continuous time
+        if not deviated or any(m.order != model.order for m in deviated):
             return None
         around.append([of_rates(m, integrating) for m in (model.lti, *deviated)])
     sizes = first.order, first.n_inputs, first.n_outputs

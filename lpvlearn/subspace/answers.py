@@ -88,20 +88,24 @@ def answering_input(pairs: Pairs) -> int | None:
     n_inputs = some[0][0].shape[1]
     if sum(max(0, len(u) - _PAST) for u, _ in some) < _PER_REGRESSOR * _PAST * n_inputs:
         return None
-    own, windows = _Windows.of(some, _PAST), _Windows.of(some, _LONGEST)
+    free = [k for k in range(n_inputs) if not _is_designed(some, k)]
+    if not free:
+        return None
+    own = _Windows.of(some, _PAST)
     own_steps: list[float] = []
     steps: list[float] = []
-    for k in range(n_inputs):
+    for k in free:
         past = own.inputs[1:].reshape(-1, own.inputs.shape[2])
         spare = past.shape[1] - len(past)
         new = _left(own.inputs[0, k], past) * float(np.sqrt(past.shape[1] / spare))
         size = float(np.std(own.inputs[0, k]))
         by_chance = _BY_CHANCE * np.sqrt(2.0 * len(past)) / spare
         foreseen = 1.0 - (new / size) ** 2 > _FORESEEN + by_chance if size else False
-        if not (foreseen and new > _EXACT * size) or _is_designed(some, k):
+        if not (foreseen and new > _EXACT * size):
             continue
         own_steps = own_steps or _steps([u for u, _ in some])
         steps = steps or _steps([y for _, y in some])
+        windows = _Windows.of(some, _LONGEST)
         if _is_answer(windows, k, new, own_steps[k], steps):
             return k
     return None

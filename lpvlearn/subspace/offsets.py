@@ -94,9 +94,10 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
         return Offsets(levels, outputs, drifts, constants, lengths)
     longest = int(lengths.max())
     slowest = min(n_changes(model.A, longest), longest)
-    decays = slowest > 1.0  # over the longest experiment
+    gain = evidence.state_space(model, 1.0).dc_gain()
+    # over the longest experiment; poles far outside overflow
+    decays = slowest > 1.0 and bool(np.isfinite(gain).all())
     if decays:
-        gain = evidence.state_space(model, 1.0).dc_gain()
         constants = outputs - levels @ gain.T
     if slowest <= _SETTLED and len(model.initial_states) == len(pairs):
         found = _as_they_begin(evidence, trends, lengths)

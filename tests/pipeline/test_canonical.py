@@ -17,6 +17,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.datasets import prbs
+from lpvlearn.pipeline.canonical import canonical_black_boxes
 
 from ..conftest import ROLES, modes, spring_sweep, spring_tables
 
@@ -253,3 +254,21 @@ def test_states_are_those_outputs_whose_parameters_noise_does_not_bend(noise):
         truth.append(frozen.C @ x)
         x = frozen.A @ x + frozen.B @ v
     assert bft_score(np.array(truth), lpv.simulate(u, wind, step)) > 99.0
+
+
+def test_pairs_of_another_order_have_no_common_form():
+    """A pole that noise moves beyond zero has two in continuous time."""
+    one = StateSpace([[-1.0]], [[1.0]], [[1.0]])
+    two = StateSpace([[-1.0, 0.1], [0.0, -9.0]], [[1.0], [0.0]], [[1.0, 0.0]])
+
+    class Local:
+        lti, order, integrating = one, 1, ()
+
+        def __init__(self, *pair):
+            self.pair = pair
+
+        def deviated(self):
+            return [self.pair]
+
+    assert canonical_black_boxes([Local(one, one)] * 2) is not None
+    assert canonical_black_boxes([Local(one, one), Local(one, two)]) is None

@@ -1,6 +1,7 @@
 """Constants and drifts of the experiments, estimated with the model."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,9 +12,14 @@ from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import constants, hankel
 from lpvlearn.subspace.constants import _tail, stands_by_chance, without_slow_modes
-from lpvlearn.subspace.offsets import far_off
+from lpvlearn.subspace.offsets import attributed, far_off
 from lpvlearn.subspace.records import Record, centred
-from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
+from lpvlearn.subspace.simulation_fit import (
+    Freedom,
+    Realization,
+    _general_regression,
+    block_fit,
+)
 from lpvlearn.systems.simulation import lti_response, trend_signals
 
 from ..benchmarks.offsets import random_system, relative_error
@@ -934,3 +940,21 @@ def test_a_given_order_has_constants_where_channels_are_off_zero():
     assert model.offset_ == "constant"
     others, measured = _tanks(np.random.default_rng(102))
     assert bft_score(measured, model.predict(others)) > 70.0
+
+
+def test_poles_far_outside_leave_outputs_where_they_are():
+    """Of two that nearly cancel each other the static gain may overflow."""
+    model = Realization(
+        np.diag([470.0, -470.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1)),
+        np.zeros((1, 2)), 1.0, trends=np.zeros((1, 1, 1)),
+    )  # fmt: skip
+    evidence = SimpleNamespace(
+        model=model,
+        output_scale=np.ones(1),
+        free=Freedom(np.ones((1, 1), bool), True, 1),
+        state_space=lambda *_: SimpleNamespace(dc_gain=lambda: np.full((1, 1), np.inf)),
+    )
+    centres = SimpleNamespace(trends=np.full((1, 1, 1), 3.0), inputs=np.ones((1, 1)))
+    u = np.random.default_rng(0).standard_normal((50, 1))
+    found = attributed(evidence, centres, [(u, u)])
+    assert np.isfinite(found.outputs).all() and np.isfinite(found.constants).all()
