@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import linalg
 
 from .criterion import EXACT, PRICE, criterion_of, n_parameters
 from .decimation import SlowStarts, decimated, full_rate
@@ -88,6 +89,9 @@ _LOSS_SLACK = {True: 1.05, False: 1.005}
 _NEARLY = 1.02
 
 _AS_GOOD = 0.999  # share of the loss of the order below that more states must beat
+
+# Horizon for the states that an order adds to the one below.
+_SHORT_HORIZON = 10
 
 # Times the squared errors of the pilot, in samples whitened alike, beyond which its
 # order must be reached: where outputs hardly show noise, as behind a filter, what they
@@ -616,7 +620,9 @@ def _try_orders(
     best, stale, left_by_best = np.inf, 0, np.inf
     energy = output_energy(records)
     slow_starts = SlowStarts(records, orders[-1], settings)
-    further, n_moves = FurtherStates(records, free), _n_moves(records)
+    # Of one step alone the states that explain most are those of its noise.
+    further = FurtherStates(records, free)
+    n_moves = _n_moves(records) if len(records) > 1 else np.inf
     for order in orders:
         enough = _LOSS_SLACK[True] * variance * left(order)
         starts = _starts(wanted, order, records, settings, enough)
@@ -626,13 +632,16 @@ def _try_orders(
         model = _refined(starts, slow, records, settings)[0]
         is_next = bool(tried) and tried[-1].order == order - 1
         below = tried[-1].candidate.model if is_next else None
-        asked = below is not None and model.loss > _AS_GOOD * below.loss
-        asked |= n_moves < n_parameters(order, records, free)
-        for start in further.beside(below) if asked and below is not None else ():
+        if below is not None and model.loss > _AS_GOOD * below.loss:
+            other = _with_more_states(below, records, settings)
+            if other is not None and other.loss < model.loss:
+                model = other
+        if below is not None and n_moves < n_parameters(order, records, free):
             # the minimum that subspaces led to may not be the best one
-            if start.loss < _NEARLY * model.loss:
-                refined = refine_simulation(start, records, free)
-                model = min(model, refined, key=_loss)
+            for start in further.beside(below):
+                if start.loss < _NEARLY * model.loss:
+                    refined = refine_simulation(start, records, free)
+                    model = min(model, refined, key=_loss)
         variance = min(variance, model.loss / left(order))
         criterion = criterion_of(model, records, settings.free, settings.repeated)
         horizon = _best_horizon(starts, refine=True)
@@ -679,6 +688,27 @@ def _refined(
         refine_simulation(one, records, settings.free, max_iter) for one in rivals
     ]
     return min(refined, key=_loss), rivals[0] is slow
+
+
+def _with_more_states(
+    model: Realization, records: Sequence[Record], settings: Settings
+) -> Realization | None:
+    """A model with one state more, for what a model leaves of the outputs."""
+    free = settings.free
+    errors = simulation_errors(model, records)
+    if not np.isfinite(model.loss):
+        return None
+    left = [Record.of(r.u.T, e) for r, e in zip(records, errors, strict=True)]
+    room = settings.max_horizon([r.n_samples for r in records])
+    horizon = min(_SHORT_HORIZON, room)
+    if settings.max_order(horizon) < 1:
+        return None
+    space = subspaces_of(left, {horizon: 1}, settings.method)[horizon]
+    more = realize(space, left, 1, settings._replace(n_noise_states=0))
+    A = linalg.block_diag(model.A, more.A)
+    C = np.hstack([model.C, more.C])
+    start = simulation_fit(A, C, records, free)
+    return refine_simulation(start, records, free)
 
 
 def _starts(
