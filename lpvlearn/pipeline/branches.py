@@ -32,6 +32,7 @@ from ..structures.interchanges import (
     interchanges,
     known_before,
     slow_first,
+    within_bounds,
 )
 from ..structures.structure import GrayBoxStructure
 
@@ -227,7 +228,7 @@ def _numbering(
     Else, and of those as far, the one whose earlier parts are the slower ones.
     """
     images = family[:, places].swapaxes(0, 1)
-    inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
+    inside = within_bounds(structure, images)
     away = np.where(inside, 0.0 if far is None else far(images), np.inf)
     near = np.isclose(away, away.min())
     merit = slow_first(structure, family, places)

@@ -569,15 +569,14 @@ list, default=None
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
+            form = self._interpolator(len(points))
             if restructurer is None:
-                form = self._interpolator(len(points))
                 ways = without_structure(*known, form, every=bool(moving))
-                found = best_along(ways, form, moving, self.sampling_time_)
             else:
                 found = with_foreseen(restructure_points(restructurer, *known, limit))
-                if moving:  # which tell what no point does
-                    ways, form = mirror_images(found), self._interpolator(len(points))
-                    found = best_along(ways, form, moving, self.sampling_time_)
+                ways = mirror_images(found) if moving else [found]
+            # experiments that move tell what no point does
+            found = best_along(ways, form, moving, self.sampling_time_)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa

@@ -76,11 +76,10 @@ def exchangeable(structure: GrayBoxStructure, theta: Array, guess: Array) -> lis
     apart. Names that differ in their digits alone are but numbered.
     """
     kinds = np.array([re.sub(r"\d+", "", name) for name in structure.parameter_names])
-    images = theta[_interchanges(structure, kinds[:, None] != kinds)]
-    inside = ((images >= structure.lower) & (images <= structure.upper)).all(1)
-    far = distance(structure, images[:, None], guess)
-    moved = (images != theta) & (inside & np.isclose(far, far[0]))[:, None]
-    return [structure.parameter_names[j] for j in np.flatnonzero(moved.any(0))]
+    places = _interchanges(structure, kinds[:, None] != kinds)
+    images = theta[places[as_plausible(structure, theta[None], places, guess)]]
+    moved = (images != theta).any(axis=0)
+    return [structure.parameter_names[j] for j in np.flatnonzero(moved)]
 
 
 def as_plausible(
@@ -92,8 +91,13 @@ def as_plausible(
     """
     images = family[:, places].swapaxes(0, 1)
     far = distance(structure, images, guess)
-    within = (images >= structure.lower) & (images <= structure.upper)
-    return np.asarray(within.all((1, 2)) & np.isclose(far, far[0]))
+    return within_bounds(structure, images) & np.isclose(far, far[0])
+
+
+def within_bounds(structure: GrayBoxStructure, images: Array) -> NDArray[np.bool_]:
+    """Which families (k, n_points, n_params) keep to the bounds."""
+    inside = (images >= structure.lower) & (images <= structure.upper)
+    return np.asarray(inside.all(axis=(1, 2)))
 
 
 def told_by_motion(structure: GrayBoxStructure, family: Array, places: Places) -> Array:

@@ -91,9 +91,7 @@ def answering_input(pairs: Pairs) -> int | None:
     free = [k for k in range(n_inputs) if not _is_designed(some, k)]
     if not free:
         return None
-    own = _Windows.of(some, _PAST)
-    own_steps: list[float] = []
-    steps: list[float] = []
+    own, predictable = _Windows.of(some, _PAST), {}
     for k in free:
         past = own.inputs[1:].reshape(-1, own.inputs.shape[2])
         spare = past.shape[1] - len(past)
@@ -101,14 +99,18 @@ def answering_input(pairs: Pairs) -> int | None:
         size = float(np.std(own.inputs[0, k]))
         by_chance = _BY_CHANCE * np.sqrt(2.0 * len(past)) / spare
         foreseen = 1.0 - (new / size) ** 2 > _FORESEEN + by_chance if size else False
-        if not (foreseen and new > _EXACT * size):
-            continue
-        own_steps = own_steps or _steps([u for u, _ in some])
-        steps = steps or _steps([y for _, y in some])
-        windows = _Windows.of(some, _LONGEST)
-        if _is_answer(windows, k, new, own_steps[k], steps):
-            return k
-    return None
+        if foreseen and new > _EXACT * size:
+            predictable[k] = new
+    if not predictable:
+        return None
+    windows = _Windows.of(some, _LONGEST)
+    u_steps, y_steps = (_steps(list(z)) for z in zip(*some, strict=True))
+    answers = (
+        k
+        for k, new in predictable.items()
+        if _is_answer(windows, k, new, u_steps[k], y_steps)
+    )
+    return next(answers, None)
 
 
 def tell_of_answering_input(pairs: Pairs, telling: Telling) -> bool:
@@ -183,12 +185,8 @@ def _is_answer(
         y = windows.outputs[first:, i]
         sizes = own_step, steps[i]
         for lags in range(_LONGEST):
-            if not lags:
-                left, rounding = _law(u[:1], y[:1], *sizes)
-            else:
-                left, rounding = _law(
-                    changes[:lags], y[: lags + 1], *sizes, changes=True
-                )
+            row = changes[:lags] if lags else u[:1]
+            left, rounding = _law(row, y[: lags + 1], *sizes, changes=lags > 0)
             if left > min(floor + _STEPS * rounding, _OF_NEW * new):
                 continue
             if not lags:

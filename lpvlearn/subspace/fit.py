@@ -124,9 +124,9 @@ def _tell_of_loop(
     feedback = fitted.feedback
     if feedback is None:
         return
-    if not (choices.estimated or choices.differences or "feedback" in telling):
-        if tell_of_answering_input(pairs, telling):
-            return
+    asked = not (choices.estimated or choices.differences or "feedback" in telling)
+    if asked and tell_of_answering_input(pairs, telling):
+        return
     if feedback.found and "feedback" not in telling:
         if feedback.shown or not fitted.model.D.any():
             tell_of_feedback(feedback, fitted, choices, doubt, telling)

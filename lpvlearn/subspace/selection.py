@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import linalg
 
 from .criterion import EXACT, PRICE, criterion_of, n_parameters
 from .decimation import SlowStarts, decimated, full_rate
@@ -89,9 +88,6 @@ _LOSS_SLACK = {True: 1.05, False: 1.005}
 _NEARLY = 1.02
 
 _AS_GOOD = 0.999  # share of the loss of the order below that more states must beat
-
-# Horizon for the states that an order adds to the one below.
-_SHORT_HORIZON = 10
 
 # Times the squared errors of the pilot, in samples whitened alike, beyond which its
 # order must be reached: where outputs hardly show noise, as behind a filter, what they
@@ -620,9 +616,7 @@ def _try_orders(
     best, stale, left_by_best = np.inf, 0, np.inf
     energy = output_energy(records)
     slow_starts = SlowStarts(records, orders[-1], settings)
-    # Of one step alone the states that explain most are those of its noise.
-    further = FurtherStates(records, free)
-    n_moves = _n_moves(records) if len(records) > 1 else np.inf
+    further = FurtherStates(records, settings)
     for order in orders:
         enough = _LOSS_SLACK[True] * variance * left(order)
         starts = _starts(wanted, order, records, settings, enough)
@@ -633,10 +627,11 @@ def _try_orders(
         is_next = bool(tried) and tried[-1].order == order - 1
         below = tried[-1].candidate.model if is_next else None
         if below is not None and model.loss > _AS_GOOD * below.loss:
-            other = _with_more_states(below, records, settings)
-            if other is not None and other.loss < model.loss:
-                model = other
-        if below is not None and n_moves < n_parameters(order, records, free):
+            start = further.of_errors(below)
+            if start is not None:
+                refined = refine_simulation(start, records, free)
+                model = min(model, refined, key=_loss)
+        if below is not None and further.n_moves < n_parameters(order, records, free):
             # the minimum that subspaces led to may not be the best one
             for start in further.beside(below):
                 if start.loss < _NEARLY * model.loss:
@@ -656,16 +651,6 @@ def _try_orders(
         if (known and stale > _PATIENCE) or model.loss <= EXACT * energy:
             break
     return tried
-
-
-def _n_moves(records: Sequence[Record]) -> float:
-    """How often inputs move, by steps of like size: ``(sum w)^2 / sum w^2``.
-
-    Of the squared changes w of all inputs together. A step beside small noise is one.
-    """
-    squares = [np.sum(np.diff(record.u, axis=1) ** 2, axis=0) for record in records]
-    w = np.concatenate(squares)
-    return float(w.sum() ** 2 / max(w @ w, np.finfo(float).tiny))
 
 
 def _refined(
@@ -688,27 +673,6 @@ def _refined(
         refine_simulation(one, records, settings.free, max_iter) for one in rivals
     ]
     return min(refined, key=_loss), rivals[0] is slow
-
-
-def _with_more_states(
-    model: Realization, records: Sequence[Record], settings: Settings
-) -> Realization | None:
-    """A model with one state more, for what a model leaves of the outputs."""
-    free = settings.free
-    errors = simulation_errors(model, records)
-    if not np.isfinite(model.loss):
-        return None
-    left = [Record.of(r.u.T, e) for r, e in zip(records, errors, strict=True)]
-    room = settings.max_horizon([r.n_samples for r in records])
-    horizon = min(_SHORT_HORIZON, room)
-    if settings.max_order(horizon) < 1:
-        return None
-    space = subspaces_of(left, {horizon: 1}, settings.method)[horizon]
-    more = realize(space, left, 1, settings._replace(n_noise_states=0))
-    A = linalg.block_diag(model.A, more.A)
-    C = np.hstack([model.C, more.C])
-    start = simulation_fit(A, C, records, free)
-    return refine_simulation(start, records, free)
 
 
 def _starts(

@@ -6,6 +6,7 @@ import pytest
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.subspace.further_states import FurtherStates
+from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import Freedom, simulation_fit
 
@@ -13,20 +14,20 @@ from lpvlearn.subspace.simulation_fit import Freedom, simulation_fit
 def test_what_one_pole_of_the_grid_leaves_out_is_found_exactly():
     rng = np.random.default_rng(0)
     u = rng.standard_normal((300, 2))
-    free = Freedom(np.zeros((2, 2), bool), initial_states=False)
-    further = FurtherStates([Record.of(u, u)], free)
+    settings = Settings(Freedom(np.zeros((2, 2), bool), initial_states=False))
+    further = FurtherStates([Record.of(u, u)], settings)
     pole = further._poles[4]
     B, C = rng.standard_normal((2, 2)), rng.standard_normal((2, 2))
     y = StateSpace(np.diag([0.2, pole]), B, C, np.zeros((2, 2)), 1.0).simulate(u)
     records = [Record.of(u, y)]
-    below = simulation_fit(np.diag([0.2]), C[:, :1], records, free)
-    first, second = FurtherStates(records, free).beside(below)
+    below = simulation_fit(np.diag([0.2]), C[:, :1], records, settings.free)
+    first, second = FurtherStates(records, settings).beside(below)
     assert first.loss <= second.loss < below.loss
     assert np.isclose(np.linalg.eigvals(first.A), pole).any()
     # The first output's share of `below` is not yet that of the plant, which refinement
     # is for: of exactly that model all is explained.
     exact = below._replace(B=B[:1])
-    assert FurtherStates(records, free).beside(exact)[0].loss < 1e-18 * np.sum(y**2)
+    assert FurtherStates(records, settings).beside(exact)[0].loss < 1e-18 * np.sum(y**2)
 
 
 def of_steps(seed, gains, constants, noise=0.02):
