@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
@@ -84,8 +84,13 @@ def retold() -> Iterator[list[Told]]:
         with collected() as told:
             yield told
     finally:
-        for message, category in told:
-            warn(message, category)
+        repeat(told)
+
+
+def repeat(told: Iterable[Told]) -> None:
+    """Give warnings that were collected."""
+    for message, category in told:
+        warn(message, category)
 
 
 def take_back(words: str) -> None:

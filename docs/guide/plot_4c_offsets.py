@@ -187,6 +187,11 @@ round(bft_score(data.y_large, y), 1)
 #   work along to MATLAB's ``ssInterpolant``.
 # * ``offsets=None`` is a model whose outputs are zero at rest at input zero; where the
 #   experiments speak against that, ``fit`` says so.
+# * Where the scheduling variable moves slowly *within* local experiments (a battery is
+#   discharged by the current that excites it), what outputs at rest do with it,
+#   :math:`y_0(\kappa(t)) - y_0(\bar\kappa)`, is no mode of the plant: it is taken
+#   out of them where inputs stand at one level everywhere and the local models are
+#   likelier so (of up to a million samples).
 # * Constants that *differ* between experiments at one point are averaged, with a
 #   warning: the model cannot know which one comes next. If they belong to levels of
 #   another quantity, make that a scheduling variable.

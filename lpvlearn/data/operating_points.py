@@ -67,6 +67,7 @@ class OperatingPoints:
 
     kappa: Array  # (n_points, n_scheduling); a column of zeros without scheduling
     experiments: list[list[Experiment]]
+    moved: Array  # (n_scheduling,), how far each moved within an experiment, at most
 
     def __len__(self) -> int:
         return len(self.kappa)
@@ -74,9 +75,8 @@ class OperatingPoints:
     def keep(self, index: Sequence[int]) -> OperatingPoints:
         """Some of the points."""
         chosen = list(index)
-        return OperatingPoints(
-            self.kappa[chosen], [self.experiments[k] for k in chosen]
-        )
+        experiments = [self.experiments[k] for k in chosen]
+        return replace(self, kappa=self.kappa[chosen], experiments=experiments)
 
     @property
     def n_longest(self) -> int:
@@ -91,9 +91,8 @@ class OperatingPoints:
     @property
     def identified_range(self) -> Array:
         """The span, widened by how far the variables moved within an experiment."""
-        moved = _motion([run for group in self.experiments for run in group])
         low, high = self.span
-        slack = moved + _ROUNDING * np.maximum(high - low, np.abs(high))
+        slack = self.moved + _ROUNDING * np.maximum(high - low, np.abs(high))
         return np.array([low - slack, high + slack])
 
 
@@ -114,19 +113,20 @@ def local_experiments(
                 "`scheduling` must name the variables that the operating points differ "
                 f"in. Got None, with {len(kappa)} values of `operating_point`."
             )
-        return OperatingPoints(np.zeros((1, 1)), groups)
+        return OperatingPoints(np.zeros((1, 1)), groups, np.zeros(1))
     _check_local(experiments, kappa)
+    moved = np.max([np.ptp(run.kappa, axis=0) for run in experiments], axis=0)
     if len(kappa) == 1:
         place = ", ".join(
             f"{value:.4g}, moving by {spread:.2g}"
-            for value, spread in zip(kappa[0], _motion(experiments), strict=True)
+            for value, spread in zip(kappa[0], moved, strict=True)
         )
         warn(
             f"All experiments are at one operating point (scheduling {place}): the "
             "model is time-invariant. Identify at further points for a model that "
             "follows the scheduling variable, or leave `scheduling` out."
         )
-    return OperatingPoints(kappa, groups)
+    return OperatingPoints(kappa, groups, moved)
 
 
 def without_spikes(experiments: Sequence[Experiment]) -> list[Experiment]:
@@ -271,14 +271,6 @@ def _extremes(signals: Sequence[Array]) -> tuple[Array, Array]:
     """Smallest and largest values over all signals, NaN aside; one read at a time."""
     low = np.fmin.reduce([np.fmin.reduce(signal) for signal in signals])
     return low, np.fmax.reduce([np.fmax.reduce(signal) for signal in signals])
-
-
-def _motion(experiments: Sequence[Experiment]) -> Array:
-    """How far each scheduling variable moves within an experiment, at most."""
-    signals = [run.scheduling for run in experiments if run.scheduling is not None]
-    if not signals:
-        return np.zeros(1)
-    return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
 
 
 def _spreads(signals: Sequence[Array], n_windows: int = _PARTS) -> Array:

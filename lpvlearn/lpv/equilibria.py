@@ -88,7 +88,7 @@ _SAME_CONSTANT = 0.05
 
 # Variance of the levels of inputs over the points, in that of their motion: none. And
 # how far, in that of the outputs, a gain that is known takes them to a common one.
-_STANDING, _FAR = 0.1, 3.0
+STANDING, _FAR = 0.1, 3.0
 
 
 def points_of_work(
@@ -122,7 +122,7 @@ def points_of_work(
         return np.hstack([inputs, outputs, x0])
     statics = _Statics.of(models, scales)
     gains = statics.gains
-    if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
+    if np.sum(np.var(inputs / u_scale, axis=0)) <= STANDING:
         common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
         change = _times(gains, common - inputs)
         # what hardly settles rests nearly anywhere, and by its gain anywhere else

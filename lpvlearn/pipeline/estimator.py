@@ -58,6 +58,7 @@ from ..validation import (
 )
 from .black_boxes import channel_sizes, foreseen_order
 from .common_choices import common_delay, identify_points
+from .held_scheduling import identified_as_held
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
 from .local_models import LocalModel, estimates_outputs, tell_of_integrators
@@ -551,7 +552,12 @@ list, default=None
                 deviate=self._needs_deviations(),
             )
             estimator = self._local()
-            local, kept = identify(estimator, points, runner)
+            if self.offsets == "auto":
+                (local, kept), points = identified_as_held(
+                    points, partial(identify, estimator), runner
+                )
+            else:
+                local, kept = identify(estimator, points, runner)
             longest = self.sampling_time_ * kept.n_longest
             channels = experiments[0].input_names, self.output_names_
             wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)

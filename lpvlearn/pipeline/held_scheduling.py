@@ -1,0 +1,178 @@
+"""Local experiments as they were, had the scheduling variables stood still.
+
+Nothing stands quite still: a battery is discharged by the very current that excites it,
+a furnace heats up, fuel is burnt. Then outputs follow where they are at rest,
+
+    ``y(t) = y0(kappa(t)) + G(q) (u - u0)``,
+
+slowly, which a model of constant scheduling takes for a mode that hardly decays, in
+place of one of the plant. What has moved with it, ``y0(kappa(t)) - y0(mean)``, is
+subtracted where the models of the points are likelier without.
+
+What outputs stand at over the points tells how ``y0`` bends, if inputs stand at one
+level everywhere. Its slope at a point the experiments there tell better: that of
+``A(q) y = B(q) u + A(1) dy0/dkappa kappa + c``, of many lags, by linear least squares.
+
+Not where the two disagree, or that follows the outputs themselves: what schedules
+itself is no motion beside the plant's, but its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from ..data.experiments import Experiment
+from ..data.operating_points import OperatingPoints
+from ..exceptions import collected, repeat
+from ..lpv.equilibria import STANDING
+from ..lpv.spline import SplineLPV
+from ..subspace.constants import CERTAIN
+from .black_boxes import channel_sizes
+from .local_models import LocalModel, motions
+from .runner import PointRunner
+
+Array = NDArray[np.float64]
+
+_Identified: TypeAlias = "tuple[list[LocalModel], OperatingPoints]"
+
+# Share of the outputs' motion that is worth it, and from which it may be the outputs'
+# own; steps from sample to sample, as a share of the outputs' and of its own size,
+# from which it is not slow; and what slopes may add to what the bends tell.
+_SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.5, 0.1, 0.5, 0.5
+
+_LAGS, _ROWS = 40, 4  # at most; and rows at least, for each parameter
+_MOST = 1_000_000  # samples, of tables that may lie on a disk
+
+
+def identified_as_held(
+    points: OperatingPoints,
+    identify: Callable[[OperatingPoints, PointRunner], _Identified],
+    runner: PointRunner,
+) -> tuple[_Identified, OperatingPoints]:
+    """Models of the points that did not fail, and all points that they are of.
+
+    As if nothing had scheduled within these, where the models are likelier so.
+    """
+    still = _held(points)
+    if still is None:
+        return identify(points, runner), points
+    held: _Identified = [], still
+    with collected() as told_held, suppress(ValueError):
+        held = identify(still, replace(runner, verbose=0))
+    if len(held[0]) < len(points) or not any(model.n_trend for model in held[0]):
+        return identify(points, runner), points
+    own: _Identified = [], points
+    with collected() as told, suppress(ValueError):
+        own = identify(points, runner)
+    if len(own[0]) == len(points):
+        pairs = zip(own[0], held[0], strict=True)
+        gain = sum(a.criterion - b.criterion for a, b in pairs)  # NaN: not told
+        if not gain > CERTAIN:
+            repeat(told)
+            return own, points
+    repeat(told_held)
+    return held, still
+
+
+def _held(points: OperatingPoints) -> OperatingPoints | None:
+    """The points without what their outputs do as scheduling variables move.
+
+    None where that is nothing, or cannot be told.
+    """
+    runs = [run for group in points.experiments for run in group]
+    n_samples = sum(len(run.rows) for run in runs)
+    if len(points) == 1 or not points.moved.any() or n_samples > _MOST:
+        return None
+    sizes = channel_sizes(points.experiments)
+    means = [tuple(mean for mean, _ in motions(g)) for g in points.experiments]
+    levels, outputs = (np.array(values) for values in zip(*means, strict=True))
+    if np.sum(np.var(levels / sizes[0], axis=0)) > STANDING:
+        return None
+    rest = SplineLPV(extrapolation="ignore").fit(points.kappa, outputs / sizes[1])
+    bends, changes = [], []
+    for group in points.experiments:
+        bent = [_about_mean(rest.predict(run.kappa)) for run in group]
+        slope = _slope(group, [sizes[1] * bend for bend in bent])
+        for run, bend in zip(group, bent, strict=True):
+            bends.append(bend)
+            changes.append(bend + _about_mean(run.kappa) @ (slope / sizes[1]))
+    if not _is_motion(bends, changes, [run.measured / sizes[1] for run in runs]):
+        return None
+    still = iter(changes)
+    groups = [
+        [_without(run, sizes[1] * next(still)) for run in group]
+        for group in points.experiments
+    ]
+    return replace(points, experiments=groups)
+
+
+def _is_motion(
+    bends: Sequence[Array], changes: Sequence[Array], outputs: Sequence[Array]
+) -> bool:
+    """Whether `changes` of the `outputs` are slow, and such as points let expect.
+
+    By how y0 bends over these, all in units of the outputs' motion.
+    """
+    size = np.max([change.std(axis=0) for change in changes], axis=0)
+    slow = _step(changes) < np.minimum(_FAST * _step(outputs), _NOISY * size)
+    added = np.vstack(changes) - np.vstack(bends)
+    expected = np.sum(added**2) < _ADDED**2 * np.sum(np.vstack(bends) ** 2)
+    matters = size > _SLIGHT
+    return bool(
+        matters.any() and slow[matters].all() and expected and size.max() < _OWN
+    )
+
+
+def _without(run: Experiment, change: Array) -> Experiment:
+    """An experiment whose scheduling stands still, and outputs without a change."""
+    still = np.zeros_like(run.kappa) + run.kappa.mean(axis=0)
+    return replace(run, outputs=run.measured - change, scheduling=still)
+
+
+def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> Array:
+    """Of outputs at rest over the scheduling variables, (n_scheduling, n_outputs).
+
+    At one point, beside what they bend. Zero where there are too few samples to tell.
+    """
+    n_scheduling, ny = group[0].kappa.shape[1], group[0].measured.shape[1]
+    per_lag = ny + group[0].inputs.shape[1]
+    lengths = [len(run.rows) for run in group]
+    lags = (sum(lengths) // _ROWS - n_scheduling) // per_lag
+    lags = min(_LAGS, lags, max(lengths) // _ROWS)
+    if lags < 1:
+        return np.zeros((n_scheduling, ny))
+    causes, effects = [], []
+    for run, bend in zip(group, bends, strict=True):
+        if len(run.rows) <= lags + 1:
+            continue
+        u, y, kappa = run.inputs, run.measured - bend, _about_mean(run.kappa)
+        past = sliding_window_view(np.hstack([y[:-1], u[:-1]]), lags, axis=0)
+        past = past.reshape(len(past), -1)
+        rows = np.hstack([past, u[lags:], kappa[lags:]])
+        known = np.isfinite(rows).all(axis=1) & np.isfinite(y[lags:]).all(axis=1)
+        causes.append(_about_mean(rows[known]))
+        effects.append(_about_mean(y[lags:][known]))
+    H = np.vstack(causes)
+    size = np.linalg.norm(H, axis=0)
+    size[size == 0.0] = 1.0
+    found = np.linalg.lstsq(H / size, np.vstack(effects))[0] / size[:, None]
+    of_past = found[: per_lag * lags].reshape(per_lag, lags, ny)[:ny].sum(axis=1)
+    return np.linalg.lstsq((np.eye(ny) - of_past).T, found[-n_scheduling:].T)[0].T
+
+
+def _about_mean(signal: Array) -> Array:
+    return np.asarray(signal - signal.mean(axis=0)) if len(signal) else signal
+
+
+def _step(signals: Sequence[Array]) -> Array:
+    """Root mean square of the steps from sample to sample, of every column."""
+    squares = np.vstack([np.diff(signal, axis=0) ** 2 for signal in signals])
+    size = np.sqrt(np.nanmean(squares, axis=0))
+    return np.where(size > 0.0, size, 1.0)

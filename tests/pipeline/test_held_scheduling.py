@@ -1,0 +1,100 @@
+"""What outputs do as scheduling variables move within local experiments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
+from lpvlearn.data.experiments import read_experiments
+from lpvlearn.data.operating_points import local_experiments
+from lpvlearn.pipeline.held_scheduling import _held, _slope
+
+ROLES = {"scheduling": "charge", "experiment": "run", "time": "t"}
+LEVELS = (0.2, 0.4, 0.6, 0.8)
+CELL = GrayBoxStructure.from_template(A=[["-a"]], B=[["b"]], C=[[-1]], D=[["-r"]])
+
+
+def at_rest(charge):
+    return 3.2 + 0.9 * charge + 0.3 * charge**2
+
+
+def discharged(n_samples=600, noise=2e-4, moved=1e-4, measured="voltage", seed=0):
+    """A cell (tau 20 s) at four charges, which its current moves."""
+    rng = np.random.default_rng(seed)
+    tables = []
+    for run, level in enumerate(LEVELS):
+        current = np.repeat(rng.choice([-5.0, 5.0], n_samples // 20), 20)
+        current -= current.mean()
+        charge = level - moved * np.cumsum(np.r_[0.0, current[:-1]])
+        state, states = 0.0, np.empty(n_samples)
+        for k, i in enumerate(current):
+            states[k] = state
+            state = np.exp(-0.05) * state + 0.02 * (1.0 - np.exp(-0.05)) * i
+        voltage = at_rest(charge) - states - 0.03 * current
+        columns = {"t": np.arange(float(n_samples)), "run": run, "current": current}
+        table = pd.DataFrame(columns | {"charge": charge, "voltage": voltage})
+        table["voltage"] += noise * rng.standard_normal(n_samples)
+        tables.append(table.assign(output=table[measured]))
+    table = pd.concat(tables, ignore_index=True)
+    return table.drop(columns=["voltage", "output"]), table[["output"]]
+
+
+def points_of(X, y):
+    estimator = LocalLPVPipeline(**ROLES)
+    return local_experiments(read_experiments(estimator, X, y))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_outputs_that_follow_the_scheduling_are_no_mode_of_the_plant(seed):
+    X, y = discharged(seed=seed)
+    restructurer = GrayBoxRestructurer(CELL)
+    found = LocalLPVPipeline(restructurer=restructurer, **ROLES).fit(X, y)
+    parameters = found.parameters_
+    assert [model.order for model in found.local_models_] == [1] * len(LEVELS)
+    np.testing.assert_allclose(parameters["a"], 0.05, rtol=0.01)
+    np.testing.assert_allclose(parameters["b"], 0.001, rtol=0.01)
+    np.testing.assert_allclose(parameters["r"], 0.03, rtol=0.01)
+    assert found.score(X, y) > 0.995
+
+
+def test_slope_is_exact_without_noise():
+    X, y = discharged(noise=0.0, moved=1e-5)
+    for group in points_of(X, y).experiments:
+        (run,) = group
+        charge = run.kappa.mean()
+        curve = 0.9 + 2.0 * 0.3 * charge
+        slope = _slope(group, [np.zeros_like(run.measured)])
+        np.testing.assert_allclose(slope, curve, rtol=1e-3)
+
+
+def test_held_experiments_lack_only_what_the_scheduling_moved():
+    X, y = discharged()
+    points = points_of(X, y)
+    for before, after in zip(
+        points.experiments, _held(points).experiments, strict=True
+    ):
+        (run,), (held,) = before, after
+        moved = at_rest(run.kappa) - at_rest(run.kappa).mean()
+        np.testing.assert_allclose(run.measured - held.measured, moved, atol=1e-3)
+        assert np.ptp(held.kappa) == 0.0
+        np.testing.assert_allclose(held.kappa[0], run.kappa.mean(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"moved": 0.0}, {"measured": "charge"}])
+def test_what_does_not_move_or_schedules_itself_stays(options):
+    assert _held(points_of(*discharged(**options))) is None
+
+
+def test_inputs_at_other_levels_stay():
+    X, y = discharged()
+    X["current"] += 10.0 * X["run"]
+    assert _held(points_of(X, y)) is None
+
+
+def test_noise_of_the_scheduling_stays():
+    X, y = discharged(moved=0.0)
+    X["charge"] += 0.01 * np.random.default_rng(0).standard_normal(len(X))
+    assert _held(points_of(X, y)) is None
