@@ -558,9 +558,10 @@ list, default=None
             if restructurer in (None, "aligned") and not wrong:
                 quiet = replace(runner, verbose=0)
                 again = partial(identify, points=kept, runner=quiet)
+                said = len(told)
                 order = _foreseen_order(estimator, local, kept, longest, again)
                 if order is not None:
-                    told[:-1] = []  # what was said of the models of more states
+                    del told[:said]  # of the models of more states
                     estimator = clone(estimator).set_params(order=order)
                     local, kept = identify(estimator, points, runner)
                 tell_of_integrators(local, self.output_names_, longest)
