@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -375,7 +375,7 @@ class OutputErrorLPV(ScheduledEstimator):
         groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
         before = _errors(start, experiments, records, own)
         run = partial(results_of, n_jobs=self.n_jobs)
-        with _Progress(self.verbose) as tell:
+        with _progress(self.verbose) as tell:
             found = refine_with_rates(
                 start,
                 records,
@@ -809,24 +809,18 @@ def _union(bounds: Any, values: Array) -> Array:
     return np.array([stacked.min(axis=0), stacked.max(axis=0)])
 
 
-class _Progress:
-    """A progress bar that tells the cost, where wanted."""
+@contextmanager
+def _progress(verbose: int) -> Iterator[Callable[[float], None]]:
+    """What hears the costs, and tells them by a progress bar where wanted."""
+    if not verbose:
+        yield lambda cost: None
+        return
+    from tqdm import tqdm  # slow to import
 
-    def __init__(self, verbose: int) -> None:
-        self.bar: Any = None
-        if verbose:
-            from tqdm import tqdm  # slow to import
+    with tqdm(desc="refinement", unit=" steps") as bar:
 
-            self.bar = tqdm(desc="refinement", unit=" steps")
+        def tell(cost: float) -> None:
+            bar.set_postfix(cost=f"{cost:.6g}")
+            bar.update()
 
-    def __enter__(self) -> Any:
-        return self._tell
-
-    def _tell(self, cost: float) -> None:
-        if self.bar is not None:
-            self.bar.set_postfix(cost=f"{cost:.6g}")
-            self.bar.update()
-
-    def __exit__(self, *exception: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
+        yield tell
