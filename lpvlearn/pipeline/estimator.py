@@ -647,10 +647,8 @@ list, default=None
                     saturated=saturated,
                 )
             report = tables(found, self.lpv_, self.sampling_time_, growth)
-            self.parameters_, self.parameters_std_ = (
-                report.parameters,
-                report.deviations,
-            )
+            self.parameters_ = report.parameters
+            self.parameters_std_ = report.deviations
             self.report_, self.parameter_report_ = report.points, report.by_parameter
             self.hinf_parameters_ = report.parameters.copy()
             for row, fitted in enumerate(found.restructurers):
