@@ -272,7 +272,9 @@ def _causes(
         return ()
     stops = np.cumsum(n_rows)[:-1]
     (a,) = whitening_filters(np.split(noise, stops))
-    columns = of_size_one(_rows(signals, a, n_own))
+    if len(a) > 1:  # else they are white as they are
+        columns = _rows(signals, a, n_own)
+    columns = of_size_one(columns)
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
     n_parts = _QUARTERS if ahead else _HALVES
