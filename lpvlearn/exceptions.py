@@ -57,6 +57,7 @@ class Told(NamedTuple):
 
     message: str
     category: type[Warning]
+    kind: str = ""  # of what may be taken back
 
 
 _COLLECTING: ContextVar[list[Told] | None] = ContextVar("collecting", default=None)
@@ -89,26 +90,27 @@ def retold() -> Iterator[list[Told]]:
 
 def repeat(told: Iterable[Told]) -> None:
     """Give warnings that were collected."""
-    for message, category in told:
-        warn(message, category)
+    for message, category, kind in told:
+        warn(message, category, kind)
 
 
-def take_back(words: str) -> None:
-    """Drop warnings that hold these words, of those that were not given yet."""
+def take_back(kind: str) -> None:
+    """Drop warnings of a kind, of those that were not given yet."""
     collecting = _COLLECTING.get()
     if collecting is not None:
-        collecting[:] = [told for told in collecting if words not in told.message]
+        collecting[:] = [told for told in collecting if told.kind != kind]
 
 
-def warn(message: str, category: type[Warning] = UserWarning) -> None:
+def warn(message: str, category: type[Warning] = UserWarning, kind: str = "") -> None:
     """Give a warning that points to the user's line, however deep it arises.
 
     That line is the one which called the outermost function of this library: what
-    lies between (joblib, a pipeline of scikit-learn) is passed over.
+    lies between (joblib, a pipeline of scikit-learn) is passed over. Of a `kind` it may
+    be taken back where more is known.
     """
     collecting = _COLLECTING.get()
     if collecting is not None:
-        collecting.append(Told(message, category))
+        collecting.append(Told(message, category, kind))
         return
     level, frame = 1, sys._getframe(1)
     outermost = 1

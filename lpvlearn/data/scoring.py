@@ -35,43 +35,68 @@ _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
 
 
-def score_from_rest(
-    estimator: Any, X: Any, y: Any, sample_weight: ArrayLike | None
-) -> float:
-    """R2 of ``estimator.predict(X)``; tells of motion, and of outputs left out."""
-    y = align_outputs(X, y, estimator)
-    measured, simulated = read_outputs(y)[0], read_outputs(estimator.predict(X))[0]
-    if measured.shape != simulated.shape:
-        raise ValueError(
-            f"`y` must have shape {simulated.shape}, as what the model simulates. Got "
-            f"{measured.shape}."
-        )
-    known = ~np.isnan(measured).any(axis=1)
-    if not known.any():
-        raise ValueError(
-            "`y` must hold at least 1 measured sample of all outputs. Got none in "
-            f"{len(measured)} rows."
-        )
-    tell_missing(measured)
-    weight = None
-    if sample_weight is not None:
-        weight = weights(sample_weight, len(measured))[known]
-        weights(weight, len(weight), "measured row")
-    squarable("y", measured[known])
-    with np.errstate(over="ignore", invalid="ignore"):
-        score = r2_score(measured[known], simulated[known], sample_weight=weight)
-    if not np.isfinite(score) and known.sum() > 1:
-        rows = np.flatnonzero(known)
-        at = np.argmax(np.abs(simulated[rows]))
-        row, i = rows[at // simulated.shape[1]], at % simulated.shape[1]
-        raise DivergenceError(
-            f"R2 is beyond all numbers: output {i} is simulated as "
-            f"{simulated[row, i]:.4g} in row {row}, and measured as "
-            f"{measured[row, i]:.4g}. A simulation by an unstable model diverges: use "
-            "BFT or VAF (`make_bft_scorer`), which are 0 then, or `predict_ahead`."
-        )
-    warn_of_motion(estimator, X, y, simulated)
-    return float(score)
+class ScoredFromRest:
+    """An estimator whose score is that of a simulation from rest.
+
+    It tells of motion, and of outputs left out.
+    """
+
+    def score(
+        self: Any, X: Any, y: Any, sample_weight: ArrayLike | None = None
+    ) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Samples of which an output is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        y = align_outputs(X, y, self)
+        measured, simulated = read_outputs(y)[0], read_outputs(self.predict(X))[0]
+        if measured.shape != simulated.shape:
+            raise ValueError(
+                f"`y` must have shape {simulated.shape}, as what the model simulates. "
+                f"Got {measured.shape}."
+            )
+        known = ~np.isnan(measured).any(axis=1)
+        if not known.any():
+            raise ValueError(
+                "`y` must hold at least 1 measured sample of all outputs. Got none in "
+                f"{len(measured)} rows."
+            )
+        tell_missing(measured)
+        weight = None
+        if sample_weight is not None:
+            weight = weights(sample_weight, len(measured))[known]
+            weights(weight, len(weight), "measured row")
+        squarable("y", measured[known])
+        with np.errstate(over="ignore", invalid="ignore"):
+            score = r2_score(measured[known], simulated[known], sample_weight=weight)
+        if not np.isfinite(score) and known.sum() > 1:
+            rows = np.flatnonzero(known)
+            at = np.argmax(np.abs(simulated[rows]))
+            row, i = rows[at // simulated.shape[1]], at % simulated.shape[1]
+            raise DivergenceError(
+                f"R2 is beyond all numbers: output {i} is simulated as "
+                f"{simulated[row, i]:.4g} in row {row}, and measured as "
+                f"{measured[row, i]:.4g}. A simulation by an unstable model diverges: "
+                "use BFT or VAF (`make_bft_scorer`), which are 0 then, or "
+                "`predict_ahead`."
+            )
+        warn_of_motion(self, X, y, simulated)
+        return float(score)
 
 
 def tell_missing(measured: Array) -> None:

@@ -564,9 +564,10 @@ list, default=None
             if restructurer in (None, "aligned") and not wrong:
                 quiet = replace(runner, verbose=0)
                 again = partial(identify, points=kept, runner=quiet)
+                said = len(told)
                 order = _foreseen_order(estimator, local, kept, longest, again)
                 if order is not None:
-                    told[:-1] = []  # what was said of the models of more states
+                    del told[:said]  # of the models of more states
                     estimator = clone(estimator).set_params(order=order)
                     local, kept = identify(estimator, points, runner)
                 tell_of_integrators(local, self.output_names_, longest)
@@ -652,10 +653,8 @@ list, default=None
                     saturated=saturated,
                 )
             report = tables(found, self.lpv_, self.sampling_time_, growth)
-            self.parameters_, self.parameters_std_ = (
-                report.parameters,
-                report.deviations,
-            )
+            self.parameters_ = report.parameters
+            self.parameters_std_ = report.deviations
             self.report_, self.parameter_report_ = report.points, report.by_parameter
             self.hinf_parameters_ = report.parameters.copy()
             for row, fitted in enumerate(found.restructurers):

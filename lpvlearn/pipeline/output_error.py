@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -365,7 +365,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self._check_options()
         start = replace(start, covariance=None)  # of coefficients that will be others
         records = [_record(e, sampling_time) for e in experiments]
-        own = Own(self.initial_state == "estimate", self.offset == "constant")
+        own = _own_of(self)
         prior, factor = None, 1.0 if self.prior == "local" else self.prior
         if known is not None and factor is not None:
             more = np.zeros(len(coefficients_of(start)) - len(known.centre))
@@ -373,12 +373,9 @@ class OutputErrorLPV(ScheduledEstimator):
             prior = weighed.widened(more)
         labels = [e.label for e in experiments]
         groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
-        before = [
-            _errors(start, e, record, own)
-            for e, record in zip(experiments, records, strict=True)
-        ]
+        before = _errors(start, experiments, records, own)
         run = partial(results_of, n_jobs=self.n_jobs)
-        with _Progress(self.verbose) as tell:
+        with _progress(self.verbose) as tell:
             found = refine_with_rates(
                 start,
                 records,
@@ -418,10 +415,7 @@ class OutputErrorLPV(ScheduledEstimator):
             self.initial_states_[k, :n] = values[:n]
             if own.constant:
                 self.offsets_[k] = values[n:]
-        after = [
-            _errors(self.lpv_, e, record, own)
-            for e, record in zip(experiments, records, strict=True)
-        ]
+        after = _errors(self.lpv_, experiments, records, own)
         self.report_ = _report(labels, records, before, after)
         tell_of_errors(self.lpv_, records, after, own, start, prior, self.max_iter)
         self.output_errors_ = output_errors(
@@ -490,8 +484,8 @@ class OutputErrorLPV(ScheduledEstimator):
                         raise
             with suppress(ValueError):
                 models += self._through_points(experiments, dt, bounds)
-        own = Own(self.initial_state == "estimate", self.offset == "constant")
-        return _promising(models, [_record(e, dt) for e in experiments], own)
+        records = [_record(e, dt) for e in experiments]
+        return _promising(models, records, _own_of(self))
 
     def _through_points(
         self, experiments: Sequence[Experiment], dt: float, bounds: Array
@@ -698,14 +692,11 @@ def local_output_errors(
     quiet, own = model.silenced(), _own_of_local(found)
     names = model.output_names or range(1, model.n_outputs + 1)
 
-    def along(some: Sequence[Record]) -> list[Array]:
-        return [_errors(quiet, e, r, own) for e, r in zip(runs, some, strict=True)]
-
     try:
-        errors = along(records)
+        errors = _errors(quiet, runs, records, own)
         if any(np.ptp(r.kappa, axis=0).any() for r in records):
-            still = [_held(record) for record in records]
-            tell_of_noisy_scheduling(model, records, errors, along(still), names)
+            still = _errors(quiet, runs, [_held(record) for record in records], own)
+            tell_of_noisy_scheduling(model, records, errors, still, names)
     except ValueError:  # it diverges, or has no matrices there
         errors = [np.full((1, model.n_outputs), np.nan)]
     return output_errors(names, errors)
@@ -723,13 +714,9 @@ def tell_of_missed(
     By the part of its errors that is no white noise, relative to how far outputs move,
     and by that of the `start` along the local experiments.
     """
-    own = Own(
-        getattr(refined, "initial_state", "estimate") == "estimate",
-        getattr(refined, "offset", None) == "constant",
-    )
     some = [e for group in found.points.experiments for e in group[:_LOOKED_AT]]
     try:
-        missed = _missed(refined.lpv_, experiments, own, sampling_time)
+        missed = _missed(refined.lpv_, experiments, _own_of(refined), sampling_time)
         there = _missed(start, some, _own_of_local(found), sampling_time)
     except ValueError:  # it diverges: told elsewhere
         return
@@ -754,9 +741,8 @@ def _missed(
     model: LPVStateSpace, experiments: Sequence[Experiment], own: Own, dt: float
 ) -> Array:
     """Errors that are no white noise, relative to how far outputs move."""
-    records, quiet = [_record(e, dt) for e in experiments], model.silenced()
-    pairs = zip(experiments, records, strict=True)
-    errors = [_errors(quiet, e, record, own) for e, record in pairs]
+    records = [_record(e, dt) for e in experiments]
+    errors = _errors(model.silenced(), experiments, records, own)
     return np.asarray(levels_of(errors).model_error * weights_of(records))
 
 
@@ -764,6 +750,14 @@ def _held(record: Record) -> Record:
     """The record with its scheduling variables held at their means."""
     kappa = record.kappa
     return record._replace(kappa=np.broadcast_to(kappa.mean(axis=0), kappa.shape))
+
+
+def _own_of(refiner: Any) -> Own:
+    """Unknowns of every experiment of a refiner, as `OutputErrorLPV` has them."""
+    return Own(
+        getattr(refiner, "initial_state", "estimate") == "estimate",
+        getattr(refiner, "offset", None) == "constant",
+    )
 
 
 def _own_of_local(found: StructuredModels) -> Own:
@@ -774,10 +768,18 @@ def _record(e: Experiment, sampling_time: float) -> Record:
     return Record(e.inputs, e.measured, e.kappa, e.sampling_time or sampling_time)
 
 
-def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:
-    """Simulation errors of a run with the unknowns of its own that fit best."""
-    with naming(e):
-        return simulated(model, record, own)[0]
+def _errors(
+    model: LPVStateSpace,
+    experiments: Sequence[Experiment],
+    records: Sequence[Record],
+    own: Own,
+) -> list[Array]:
+    """Simulation errors of runs, each with the unknowns of its own that fit best."""
+    errors = []
+    for e, record in zip(experiments, records, strict=True):
+        with naming(e):
+            errors.append(simulated(model, record, own)[0])
+    return errors
 
 
 def _report(
@@ -807,24 +809,18 @@ def _union(bounds: Any, values: Array) -> Array:
     return np.array([stacked.min(axis=0), stacked.max(axis=0)])
 
 
-class _Progress:
-    """A progress bar that tells the cost, where wanted."""
+@contextmanager
+def _progress(verbose: int) -> Iterator[Callable[[float], None]]:
+    """What hears the costs, and tells them by a progress bar where wanted."""
+    if not verbose:
+        yield lambda cost: None
+        return
+    from tqdm import tqdm  # slow to import
 
-    def __init__(self, verbose: int) -> None:
-        self.bar: Any = None
-        if verbose:
-            from tqdm import tqdm  # slow to import
+    with tqdm(desc="refinement", unit=" steps") as bar:
 
-            self.bar = tqdm(desc="refinement", unit=" steps")
+        def tell(cost: float) -> None:
+            bar.set_postfix(cost=f"{cost:.6g}")
+            bar.update()
 
-    def __enter__(self) -> Any:
-        return self._tell
-
-    def _tell(self, cost: float) -> None:
-        if self.bar is not None:
-            self.bar.set_postfix(cost=f"{cost:.6g}")
-            self.bar.update()
-
-    def __exit__(self, *exception: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
+        yield tell

@@ -189,18 +189,22 @@ def tell_skipped(found: Sequence[Done | None], kappa: Array) -> None:
 
     Those that differ in numbers alone are one, which tells their ranges.
     """
-    kinds: dict[tuple[str, type[Warning]], list[tuple[int, str]]] = {}
+    kinds: dict[Told, list[tuple[int, str]]] = {}
     for k, done in enumerate(found):
-        for message, category in done.told if done is not None else ():
-            kind = _NUMBER.sub("#", message), category
-            kinds.setdefault(kind, []).append((k, message))
-    for (_, category), told in kinds.items():
+        for one in done.told if done is not None else ():
+            kind = one._replace(message=_NUMBER.sub("#", one.message))
+            kinds.setdefault(kind, []).append((k, one.message))
+    for kind, told in kinds.items():
         points = dict.fromkeys(k for k, _ in told)
         message = _ranges_told([text for _, text in told])
         place = "all operating points"
         if len(points) < len(kappa):
             place = ", ".join(place_of(k, kappa) for k in points)
-        warn(message if len(kappa) == 1 else f"{message} (At {place}.)", category)
+        warn(
+            message if len(kappa) == 1 else f"{message} (At {place}.)",
+            kind.category,
+            kind.kind,
+        )
 
 
 def _ranges_told(texts: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..data.containers import OutputContainer
 from ..data.experiments import Experiment, read_experiments
 from ..data.preparation import read_runs
-from ..data.scoring import score_from_rest
+from ..data.scoring import ScoredFromRest
 from ..data.tables import n_rows_of
 from ..data.timestamps import check_unit
 from ..exceptions import VersionedPickle
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 class ScheduledEstimator(
     OutputContainer,
+    ScoredFromRest,
     VersionedPickle,
     MultiOutputMixin,
     RegressorMixin,
@@ -161,28 +162,6 @@ class ScheduledEstimator(
         """
         check_is_fitted(self, "lpv_")
         return self._simulate(self._read(X, y, outputs=False), X, estimate=True)
-
-    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
-        """Coefficient of determination of the simulation from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
-            Samples of which an output is missing (NaN) are left out.
-        sample_weight : array-like of shape (n_samples,), default=None
-
-        Returns
-        -------
-        float
-            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
-
-        Warns
-        -----
-        UserWarning
-            If an experiment starts in mid-motion, which a simulation from rest misses.
-        """
-        return score_from_rest(self, X, y, sample_weight)
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment of a table, in the order of time."""

@@ -29,6 +29,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.interchanges import (
+    INTERCHANGE,
     as_plausible,
     interchanges,
     known_before,
@@ -70,7 +71,6 @@ _ASTRAY, _LIKE = 5.0, 0.01
 # and interchanges that are compared along experiments at most
 _ANOTHER, _TOLD = 0.01, 0.2
 _IMAGES = 24
-_OF_A_POINT = "no response tells these parts of the structure apart"  # the warning
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -265,7 +265,7 @@ def mirror_images(found: StructuredModels) -> list[StructuredModels]:
     """
     mirrored, others = [found], _images(found)[0]
     if len(others):
-        take_back(_OF_A_POINT)
+        take_back(INTERCHANGE)
     for places in others:
         theta = found.theta[:, places]
         models = _delayed(found.structure, theta, found.local)
@@ -311,7 +311,7 @@ def tell_of_mirror_images(found: StructuredModels, model: LPVStateSpace) -> None
     places, change = _images(found, family)
     if not (change > _TOLD).any():
         return
-    take_back(_OF_A_POINT)
+    take_back(INTERCHANGE)
     moved = (places[change > _TOLD] != np.arange(places.shape[1])).any(axis=0)
     names = [found.structure.parameter_names[j] for j in np.flatnonzero(moved)]
     warn(

@@ -76,8 +76,8 @@ def through_black_boxes(
     estimates = [model.estimates for model in found.local]
     boxes = [UncertainBoxes.of(structure, own) if own else None for own in estimates]
     if determined and explained:
-        own, there = _misfit(boxes, found.theta), _misfit(boxes, form.predict(kappa))
-        if not own < _FAR or there < _FAR:
+        there = _misfit(boxes, form.predict(kappa))  # of most forms that is near
+        if there < _FAR or not _misfit(boxes, found.theta) < _FAR:
             return None
     together = fitted_together(structure, boxes, kappa, found.theta)
     if together is None:

@@ -25,7 +25,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
-from ..structures.interchanges import exchangeable, known_before
+from ..structures.interchanges import INTERCHANGE, exchangeable, known_before
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import PeakSet
 from ..systems.threads import one_blas_thread
@@ -936,7 +936,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "be those of one another: no response tells these parts of the "
                 "structure apart. Say which is which by structure.with_bounds(), "
                 "structure.with_ranges(), or a first guess, `init`; or number their "
-                "names, as 'lag_1' and 'lag_2', where it does not matter."
+                "names, as 'lag_1' and 'lag_2', where it does not matter.",
+                kind=INTERCHANGE,
             )
 
     # -- use -----------------------------------------------------------------------

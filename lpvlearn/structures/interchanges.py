@@ -48,6 +48,8 @@ _SLOWEST = 1e-3  # rate at which what is remembered fades at least, of the faste
 _WIDE, _GRID = 10.0, 60  # beyond the rates of a model, and frequencies to look at
 _PLACES = 12  # operating points that are compared at most
 
+INTERCHANGE = "interchange"  # the kind of warnings of parts that one model leaves alike
+
 
 def interchanges(structure: GrayBoxStructure) -> Places:
     """Permutations of the parameters that change no response, shape (k, n_params).

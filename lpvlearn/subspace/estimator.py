@@ -24,7 +24,7 @@ from ..data.experiments import (
     read_experiments,
 )
 from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
-from ..data.scoring import score_from_rest
+from ..data.scoring import ScoredFromRest
 from ..data.tables import Table, n_rows_of, read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
@@ -102,7 +102,12 @@ _TAKEN = (
 
 
 class SubspaceLTI(
-    OutputContainer, VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator
+    OutputContainer,
+    ScoredFromRest,
+    VersionedPickle,
+    MultiOutputMixin,
+    RegressorMixin,
+    BaseEstimator,
 ):
     """Linear time-invariant state-space model by subspace identification.
 
@@ -995,28 +1000,6 @@ class SubspaceLTI(
         experiments = self._read(X, y, outputs=False)
         return self._in_table(experiments, X, self._simulator().from_own_beginning)
 
-    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
-        """Coefficient of determination of the simulation from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs. Samples of which one is missing (NaN) are left out.
-        sample_weight : array-like of shape (n_samples,), default=None
-
-        Returns
-        -------
-        float
-            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
-
-        Warns
-        -----
-        UserWarning
-            If an experiment starts in mid-motion, which a simulation from rest misses.
-        """
-        return score_from_rest(self, X, y, sample_weight)
-
     @one_blas_thread
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
@@ -1383,13 +1366,9 @@ class SubspaceLTI(
 
     def _simulator(self) -> Simulator:
         """The model with what is known of its experiments."""
+        known = self.lti_, self._evidence, self._offsets, self.offset is not None
         held = getattr(self, "steady_start_", False)
-        state, constants = (
-            getattr(self, "begun_state_", None),
-            self.offset is not None,
-        )
-        known = self.lti_, self._evidence, self._offsets
-        return Simulator(*known, constants, held, state)
+        return Simulator(*known, held, getattr(self, "begun_state_", None))
 
     def _in_table(
         self,

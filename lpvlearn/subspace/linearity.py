@@ -46,7 +46,7 @@ from .residuals import (
     whitening_filters,
     without,
 )
-from .simulation_fit import Realization, simulation_errors, with_initial_states
+from .simulation_fit import Realization, simulation_errors
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -118,9 +118,7 @@ def find_bend(evidence: Evidence, *, apart: bool = False) -> Bend | None:
     records = [record for record in records if record.n_samples > 2 * N_LAGS]
     if not records:
         return None
-    model = with_initial_states(
-        evidence.model, records, evidence.free, evidence.whitening.weight
-    )
+    model = evidence.begun_in(records)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = simulation_errors(model, records)
     bend = _bend_ahead(records, errors, apart)
@@ -274,7 +272,9 @@ def _causes(
         return ()
     stops = np.cumsum(n_rows)[:-1]
     (a,) = whitening_filters(np.split(noise, stops))
-    columns = of_size_one(_rows(signals, a, n_own))
+    if len(a) > 1:  # else they are white as they are
+        columns = _rows(signals, a, n_own)
+    columns = of_size_one(columns)
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
     n_parts = _QUARTERS if ahead else _HALVES

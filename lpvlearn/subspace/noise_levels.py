@@ -108,9 +108,8 @@ def _noise_sizes(fitted: LocalFit) -> Array | None:
     """
     evidence = fitted.evidence
     records, (filter_, weight) = evidence.records, evidence.whitening
-    model = with_initial_states(evidence.model, records, evidence.free, weight)
     lost, sizes = len(filter_) - 1, []
-    for error in simulation_errors(model, records):
+    for error in simulation_errors(evidence.begun_in(records), records):
         tells = len(error) > 2 * lost and (len(error) - lost) * len(weight) >= _VALUES
         white = through_filter(filter_, error) if tells else error[:0]
         sizes.append(np.sqrt(np.mean((white @ weight.T) ** 2)) if tells else np.nan)

@@ -57,7 +57,7 @@ from ..validation import one_of, share, whole_number
 from .hankel import correlation_sequence, factor_of_pieces
 from .noise import autoregression, through_filter, whitening_filter
 from .records import centred, thinned
-from .simulation_fit import simulation_errors, with_initial_states
+from .simulation_fit import simulation_errors
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -473,8 +473,7 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
     if not np.isfinite(evidence.model.loss):
         return False
     records = thinned(evidence.records, _MAX_SAMPLES)
-    weight, trend = evidence.whitening.weight, DETRENDS[evidence.free.n_trend]
-    model = with_initial_states(evidence.model, records, evidence.free, weight)
+    model, trend = evidence.begun_in(records), DETRENDS[evidence.free.n_trend]
     errors = simulation_errors(model, records)
     inputs, errors = _without_trends([record.u.T for record in records], errors, trend)
     outputs = np.hstack([record.y for record in records])

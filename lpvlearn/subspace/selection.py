@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -111,6 +112,9 @@ _BEYOND = 100.0
 # Times the squared errors on parts held out, beyond which those on the samples of the
 # fit are of what these parts do not show: a step that comes before all of them.
 _EASIER = 10.0
+
+
+_criterion, _loss = attrgetter("criterion"), attrgetter("loss")  # that is to be least
 
 
 class Row(NamedTuple):
@@ -315,14 +319,6 @@ def _search(
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)
     return Selection(chosen, candidate.horizon, rows, candidate, errors[chosen])
-
-
-def _criterion(one: _Tried) -> float:
-    return one.criterion
-
-
-def _loss(model: Realization) -> float:
-    return model.loss
 
 
 def _is_beyond(

@@ -206,9 +206,12 @@ class Evidence:
         """Autoregression of the simulation errors, in the scale of the records."""
         if self.told is not None:
             return self.told.noise
+        return _noise_of(self.begun_in(self.records), self.records)
+
+    def begun_in(self, records: Sequence[Record]) -> Realization:
+        """The model with the own unknowns that fit some records best."""
         weight = self.whitening.weight
-        model = with_initial_states(self.model, self.records, self.free, weight)
-        return _noise_of(model, self.records)
+        return with_initial_states(self.model, records, self.free, weight)
 
     @cached_property
     def covariance(self) -> Array:

@@ -917,8 +917,8 @@ def test_pickles_of_another_version_warn(fitted, monkeypatch):
             with collected() as told:
                 pickle.loads(content)
         text = f"A pickled {type(model).__name__} was written by lpvlearn "
-        assert any(message.startswith(text) for message, _ in told)
-        assert {category for _, category in told} == {VersionWarning}
+        assert any(one.message.startswith(text) for one in told)
+        assert {one.category for one in told} == {VersionWarning}
     public = (getattr(lpvlearn, name) for name in lpvlearn.__all__)
     classes = (c for c in public if isinstance(c, type))
     assert all(issubclass(c, VersionedPickle) for c in classes)
