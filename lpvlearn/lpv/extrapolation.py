@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 # measured mean and a range read from a report differ by rounding.
 _RANGE_RTOL = 1e-6
 
+_NEAR = 0.01  # of the range that a model has seen: beyond it, but nothing to tell of
+
 _MANY_VARIABLES = 4  # beyond, a hull has too many faces
 _BESIDE = 0.05  # of the ranges: distance from the hull that is still near it
 
@@ -44,13 +46,14 @@ def warn_extrapolation(
 ) -> None:
     """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
 
-    The message names every such variable, its range and the farthest value.
+    By more than another run through the same range may be. The message names every
+    such variable, its range and the farthest value.
     """
     low, high = identified_range
     width = np.where(high > low, high - low, 1.0)
     excess = np.maximum(low - kappa, kappa - high) / width
     said = []
-    for j in np.flatnonzero((excess > 0).any(axis=0)):
+    for j in np.flatnonzero((excess > _NEAR).any(axis=0)):
         farthest = kappa[np.argmax(excess[:, j]), j]
         least, most, value = (
             number_shown(v, width[j]) for v in (low[j], high[j], farthest)

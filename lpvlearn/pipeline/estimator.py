@@ -33,7 +33,7 @@ from ..data.operating_points import (
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.tables import as_list, read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing, collected, retold, warn
+from ..exceptions import all_or_nothing, collected, retold, take_back, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
@@ -45,6 +45,7 @@ from ..metrics.scorers import InitialState
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
+from ..subspace.fit_warnings import LINE
 from ..subspace.integrating import integrating_flags
 from ..systems.threads import one_blas_thread
 from ..systems.whole_files import whole_file
@@ -57,7 +58,7 @@ from ..validation import (
     verbosity,
 )
 from .black_boxes import channel_sizes, foreseen_order
-from .common_choices import common_delay, identify_points
+from .common_choices import common_delay, identify_points, of_one_method
 from .held_scheduling import identified_as_held
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
@@ -558,6 +559,7 @@ list, default=None
                 )
             else:
                 local, kept = identify(estimator, points, runner)
+            take_back(LINE)  # the LPV model rests where it begins
             longest = self.sampling_time_ * kept.n_longest
             channels = experiments[0].input_names, self.output_names_
             wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
@@ -897,13 +899,11 @@ def _foreseen_order(
     if not isinstance(getattr(estimator, "order", None), str):
         return None
 
-    chosen, methods = {}, {model.method for model in local}
-    if len(methods) == 1 and getattr(estimator, "method", None) == "auto":
-        chosen["method"] = methods.pop()  # looked for once
+    chosen = of_one_method(estimator, local)
 
     def identified(order: int) -> list[LocalModel]:
         with collected(), suppress(ValueError):
-            found, kept = identify(clone(estimator).set_params(order=order, **chosen))
+            found, kept = identify(clone(chosen).set_params(order=order))
             return found if len(kept) == len(points) else []
         return []
 

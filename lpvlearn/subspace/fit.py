@@ -17,6 +17,7 @@ from .cross_checks import tell_of_contradiction, tell_of_input_spikes
 from .drift import of_drifting_noise
 from .fit_warnings import (
     tell_of_answers,
+    tell_of_drift,
     tell_of_dropouts,
     tell_of_feedback,
     tell_of_held_outputs,
@@ -104,6 +105,8 @@ def fit_samples(
         fitted = moved_back(fitted, first, differ)
     if detrend is not None:
         fitted = fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+    if choices.offset == "auto":
+        tell_of_drift(fitted, outputs, telling)
     return fitted, samples
 
 

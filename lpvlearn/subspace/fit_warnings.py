@@ -48,6 +48,8 @@ _BENDS = {"bent", "limit", "held", "dropouts", "input spikes", "lines"}
 _MOVES_ON = 0.05  # of the motion of the model, at least
 _AT_LIMITS = 0.01  # of the samples, at least, to be told
 
+LINE = "line"  # the kind of what is told of outputs that drift along one
+_DRIFTS = 0.1  # to either side, of the motion of the output
 _SOME = 3  # values that are listed
 
 # What errors follow of a system that is not linear, by its causes
@@ -227,6 +229,31 @@ def tell_of_limits(
             )
 
 
+def tell_of_drift(fitted: LocalFit, outputs: Sequence[Array], telling: Telling) -> None:
+    """Tell of drifts that matter to a simulation, which stands in their middle."""
+    drifts = fitted.offsets.drifts
+    if not drifts.any() or len(drifts) != len(outputs):
+        return
+    lines = [
+        np.outer(np.linspace(-0.5, 0.5, len(y)), (len(y) - 1) * drift)
+        for y, drift in zip(outputs, drifts, strict=True)
+    ]
+    left = [y - line for y, line in zip(outputs, lines, strict=True)]
+    largest = np.max(np.abs([line[0] for line in lines]), axis=0)
+    share = largest / np.vstack([part - part.mean(axis=0) for part in left]).std(axis=0)
+    if share.max() > _DRIFTS:
+        i = int(share.argmax())
+        telling.once(
+            LINE,
+            f"Output {telling.output(i)} drifts along a line that inputs do not "
+            f"explain, by {2.0 * largest[i]:.3g} within an experiment. That was taken "
+            "for a sensor's, or a load's, and `predict` stands in the middle, "
+            f"{100.0 * share[i]:.0f} % of the output's motion from either end. Remove "
+            "it from `y`, use predict_with_initial_state, or offset='constant' if the "
+            "plant itself drifts.",
+        )
+
+
 def tell_of_feedback(
     feedback: Feedback,
     fitted: LocalFit,
@@ -382,7 +409,7 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
     else:
         remedy = "a higher `order`"
         if not chose_order:
-            remedy += " (order='auto' finds it; beside a structure it is that of this)"
+            remedy += " (of points that agree, or a structure, it is theirs)"
         # Without figures, so that a search over orders says it once of each.
         telling.once(
             "lack",

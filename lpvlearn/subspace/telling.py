@@ -33,7 +33,7 @@ class Telling:
         """Warn of a kind of thing that was not told before; from now on it was."""
         if kind not in self:
             self.kinds.add(kind)
-            warn(message, category)
+            warn(message, category, kind)
 
     def aside(self, *silent: str) -> Self:
         """What tells the same but of these kinds, and is not remembered here."""

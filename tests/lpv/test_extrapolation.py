@@ -8,7 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import PolynomialLPV
 from lpvlearn.exceptions import ExtrapolationWarning
-from lpvlearn.lpv.extrapolation import distance_from_hull, warn_outside_hull
+from lpvlearn.lpv.extrapolation import (
+    distance_from_hull,
+    warn_extrapolation,
+    warn_outside_hull,
+)
 
 TRIANGLE = np.array([[0.0, 0.0], [0.0, 10.0], [2.0, 0.0]])
 NAMES = ["mass", "speed"]
@@ -72,3 +76,11 @@ def test_the_farthest_variable_is_that_farthest_out_of_its_range():
     form.fit([[0.0, 0.0], [0.1, 0.0], [0.0, 1000.0]], [0.0, 1.0, 2.0])
     with pytest.raises(ValueError, match=r"\[0, 0.1\] for variable 1.*farthest 1\."):
         form.predict([[1.0, 1020.0]])
+
+
+def test_a_run_hardly_beyond_the_range_is_not_told(recwarn):
+    seen = np.array([[1.0], [2.0]])
+    warn_extrapolation(np.array([[0.992], [2.008]]), seen, ["k"])
+    assert not recwarn
+    with pytest.warns(ExtrapolationWarning, match="2 of 3 samples .* at 2.02"):
+        warn_extrapolation(np.array([[0.992], [1.5], [2.02]]), seen, ["k"])

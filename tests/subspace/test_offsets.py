@@ -115,6 +115,20 @@ def test_the_resting_point_may_be_where_drifts_begin(rng):
     np.testing.assert_allclose(middle - begun, 4.0 * np.array([1.0, -2.0]))
 
 
+def test_a_drift_that_a_simulation_misses_is_told(rng):
+    u = np.repeat(rng.choice([-1.0, 1.0], 50), 10)[:, None]
+    plant = StateSpace([[0.8]], [[0.2]], [[1.0]], sampling_time=1.0)
+    y = plant.simulate(u)[:, 0] + 0.02 * rng.standard_normal(500)
+    SubspaceLTI(sampling_time=1.0).fit(u, y + np.linspace(0.0, 0.05, 500))
+    with pytest.warns(UserWarning, match="Output 1 drifts.* by 2 .*predict_with"):
+        model = SubspaceLTI(sampling_time=1.0).fit(u, y + np.linspace(0.0, 2.0, 500))
+    assert model.offset_ == "linear"
+    SubspaceLTI(offset="linear", sampling_time=1.0).fit(
+        u, y + np.linspace(0.0, 2.0, 500)
+    )
+
+
+@pytest.mark.filterwarnings("ignore:Output . drifts along a line")
 @pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
 def test_a_given_order_does_not_hide_a_drift(rng, size):
     """It has no state left to follow it."""
@@ -124,6 +138,7 @@ def test_a_given_order_does_not_hide_a_drift(rng, size):
     assert error_of(given) < 0.05
 
 
+@pytest.mark.filterwarnings("ignore:Output . drifts along a line")
 @pytest.mark.parametrize("order", ["auto", 3])
 def test_a_drift_is_no_integrator_that_the_level_of_an_input_moves(rng, order):
     X, y = table(rng, levels=(5.0,), n=600, noise=0.1, drift=3.0, u0=4.0)
