@@ -102,7 +102,9 @@ def identify_points(
         some = _spread(len(groups), _SCOUTS)
         scouts = tried(local, some, known) if search else []
         if local.get_params(deep=False).get("offset") == "auto":
-            found = _of_own_orders(local, attempted, scouts, known)
+            # whatever the others are, but where drifts are what all of them lack
+            fails = scouts and not any(scouts) and runner.on_error == "raise"
+            found = known if fails else _of_own_orders(local, attempted, scouts, known)
             found = _drifting_alike(local, tried, found)
             found = identify(local, found) if None in found else found
         else:
@@ -310,6 +312,9 @@ def _drifting_alike(
     if not any(doubtful) and len(models) == len(found):
         return found
     drifting = of_one_method(local, models).set_params(offset="linear")
+
+    if not models and tried(drifting, [0])[0] is None:
+        return found
 
     def anew(known: list[Done | None], again: Sequence[int]) -> list[Done | None]:
         new = tried(drifting, again) if again else known
