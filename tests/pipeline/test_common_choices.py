@@ -190,3 +190,18 @@ def test_points_together_tell_that_outputs_drift(seed):
         assert found.dc_gain().item() == pytest.approx(
             2.0 * np.sqrt(level) / 0.45, rel=0.1
         )
+
+
+def test_points_of_which_none_has_a_model_are_refused_by_a_few(monkeypatch):
+    fitted = []
+
+    def refused(local, experiments, **options):
+        fitted.append(experiments[0].label)
+        raise ValueError(f"{fitted[-1]} must be stable")
+
+    monkeypatch.setattr(common_choices, "identify_point", refused)
+    X, y = spring_tables(kappas=np.arange(9.0), n_samples=50)
+    with pytest.raises(ValueError, match="operating point 0 .* p0r0 must be"):
+        LocalLPVPipeline(**ROLES).fit(X, y)
+    # scouts, one with a drift, and two to tell the point from the options
+    assert fitted == ["p0r0", "p4r0", "p8r0", "p0r0", "p0r0", "p8r0"]
