@@ -28,6 +28,7 @@ from ..exceptions import warn
 from ..lpv.alignment import spanning_tree
 from ..lpv.auto import AutoLPV
 from ..lpv.polynomial import PolynomialLPV, resolvable_powers
+from ..lpv.weighting import is_chance
 from ..restructuring.deadline import time_is_up
 from ..restructuring.minimise_covariance import UncertainBoxes, common_coefficients
 from ..structures.structure import GrayBoxStructure
@@ -82,18 +83,32 @@ def through_black_boxes(
     together = fitted_together(structure, boxes, kappa, found.theta)
     if together is None:
         return None
-    warn(
-        "the parameters of the operating points lie on no smooth function, as where "
-        "data hardly tell some of them apart. One goes through the identified models "
-        f"all the same: its chi-square is {together.misfit:.2g} per degree of freedom. "
-        "The LPV model takes that; parameters of single points (`parameters_`) may be "
-        "others that say nearly the same. Fix or bound parameters in the structure to "
-        "tell them apart."
-    )
+    # a form that the black boxes refute is near to parameters that tell too little
+    trusted = determined and not explained
+    if not (trusted and _meets_some_form(form, structure.n_params)):
+        warn(
+            "the parameters of the operating points lie on no smooth function, as "
+            "where data hardly tell some of them apart. One goes through the "
+            "identified models all the same: its chi-square is "
+            f"{together.misfit:.2g} per degree of freedom. The LPV model takes that; "
+            "parameters of single points (`parameters_`) may be others that say nearly "
+            "the same. Fix or bound parameters in the structure to tell them apart."
+        )
     degree = together.form.degree
     chosen = form.replaced(f"polynomial {degree} through the models", together.form)
     models = [found.structure.model(row) for row in together.form.predict(kappa)]
     return chosen, together.covariance, found._replace(models=models)
+
+
+def _meets_some_form(form: AutoLPV, n_params: int) -> bool:
+    """Whether the parameters lie on some smooth function, as far as noise lets tell.
+
+    It need not be chosen: where it foresees no more than a curve does, that one is. But
+    as many values as a point has must speak for it: of fewer, chance explains too much.
+    """
+    chi2, dof = form.selection_["chi2"], form.selection_["dof"]
+    pairs = zip(chi2, dof, strict=True)
+    return any(k >= n_params and is_chance(value, k) for value, k in pairs)
 
 
 def _misfit(boxes: Sequence[UncertainBoxes | None], theta: Array) -> float:

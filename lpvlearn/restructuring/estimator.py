@@ -204,7 +204,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     convergence_ : {"optimal", "nearly", "saddle", "no"}
         What the certificates make of the result: stationary to 1e-5, or to 1e-3 only; a
         saddle that no step along its negative curvature led out of; or neither, and the
-        best point met was kept. The last two are warned of.
+        best point met was kept. The last two are warned of; "no" not where
+        `params_` are efficient ones, found, whose error the noise explains.
     identifiability_ : Identifiability
         Which parameters the response determines, and how far its errors grow into
         them.
@@ -687,13 +688,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.fit_error_, self.start_params_ = errors[0], fits[0].x
             self.params_, result, floor = self._minimise(problem, fits)
             self._describe(problem, result, floor)
+            settled = False
             if self.norm == "covariance":
-                self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
+                others = [fit.x for fit in promising(fits)]
+                settled = self._weigh(problem, estimates, others)
             at = ParameterUncertainty(problem, self.params_)
             self.identifiability_ = at.identifiability()
             guessed = not isinstance(self.init, str) or only_given
             doubted = not (guessed or found.certain)
-            self._warn(problem, result, enough, doubted, hurried)
+            self._warn(problem, result, enough, doubted, hurried, settled)
         return at
 
     def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
@@ -797,10 +800,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         problem: RestructuringProblem,
         estimates: Sequence[Estimate],
         others: Sequence[Array],
-    ) -> None:
+    ) -> bool:
         """From the H-infinity optimum to the parameters weighed by the uncertainty.
 
-        Or from `others`, least-squares fits of several basins.
+        Or from `others`, least-squares fits of several basins. Returns whether the
+        search for them converged where the noise explains the error that they leave.
         """
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
@@ -824,7 +828,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.system, self.params_, problem.margin, [box]
             )
         if found is None:
-            return
+            return False
         self.params_, self.params_covariance_ = found.theta, found.covariance
         self._stand_at(problem)
         self.chi2_, self.objective_ = found.cost, np.sqrt(found.cost)
@@ -847,6 +851,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "an input that answers late (`input_delay`), or keep the H-infinity "
                 "optimum by norm='hinf' (in a pipeline, efficient=False)."
             )
+        return found.converged and found.p_value > IMPLAUSIBLE
 
     def _warn(
         self,
@@ -855,11 +860,14 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         enough: float,
         doubted: bool,
         hurried: bool,
+        settled: bool,
     ) -> None:
         """Warn of a search that did not converge, a poor fit, and open parameters.
 
         And of a `doubted` fit, at which one round of starts alone ended, or of a search
-        that was `hurried`.
+        that was `hurried`. Efficient parameters that are `settled`, found and with an
+        error that the noise explains, do not hang on where the search for the least
+        norm stopped before them; those of a wrong basin noise would not explain.
         """
         errors = self.starts_["relative_error"].to_numpy()
         timed_out = hurried and errors[0] > enough
@@ -873,7 +881,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
             doubted = False  # no more can be said of the starts
-        elif not result.converged:
+        elif not (result.converged or settled):
             spent = self.n_iter_ >= self.max_iter
             warn(
                 f"the search {'ended at' if spent else 'stalled before'} "

@@ -21,7 +21,7 @@ from ..minimax.sqp import minimax_sqp
 from .central_path import PathPoint, central_path
 from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, View
 from .deadline import time_is_up
-from .error_system import ErrorSystem, Target, vanishing_weight
+from .error_system import ErrorSystem, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
 
@@ -233,7 +233,7 @@ def minimise_hinf(
     Where that floor is above all other peaks, the start is already optimal, and so is
     every theta that keeps the others below it. Then a weight that vanishes at the
     floor's frequency sets it aside, and the norm of what remains is minimised among
-    these points.
+    these points; and so it is where the search comes down to the floor, and stalls.
     """
     theta0 = fits[0].x
     start = system.peaks(theta0)
@@ -252,16 +252,50 @@ def minimise_hinf(
         theta, result, floor = _from_least_squares(
             system, fits, limits, solver, max_iter, options
         )
-        return theta, result, floor if floor > negligible else 0.0
-    weight = vanishing_weight(system, objective.floor_frequency)
+        if floor <= negligible:
+            return theta, result, 0.0
+        if floor < result.peaks.top:
+            return theta, result, floor
+        # the search came down to the floor, below which no norm is: an optimum, that
+        # the peaks beside it do not certify
+        if not result.converged:
+            theta, result = _gone_on(system, theta, result, limits, max_iter, options)
+        return theta, _certified(result), floor
     floor, options["max_iter"] = objective.floor, max_iter
-    theta, result = _minimise_remainder(
-        system, weight, objective, theta0, limits, options
-    )
-    # a constant peak is active: its zero gradient certifies the optimum, though
-    # not a strict one
-    certified = replace(result, stationarity=0.0, second_order=0.0, converged=True)
-    return theta, certified, floor
+    theta, result = _minimise_remainder(system, objective, theta0, limits, options)
+    return theta, _certified(result), floor
+
+
+def _certified(result: MinimaxResult) -> MinimaxResult:
+    """The result at a constant peak, whose zero gradient certifies the optimum.
+
+    Though not a strict one.
+    """
+    return replace(result, stationarity=0.0, second_order=0.0, converged=True)
+
+
+def _gone_on(
+    system: ErrorSystem,
+    theta: Array,
+    result: MinimaxResult,
+    limits: Limits,
+    max_iter: int,
+    options: dict[str, Any],
+) -> tuple[Array, MinimaxResult]:
+    """From where a search came down to the floor, what remains is minimised.
+
+    In the steps that are left. The start where nothing lower is found.
+    """
+    T = ResponseGeometry(system, theta, system.grid, system.peaks(theta).norm).T
+    above = HinfObjective(system, theta, T, limits)
+    if above.peaks(np.zeros(len(theta))) is None or above.floor == 0.0:
+        return theta, result  # the floor is no peak here
+    options = options | {"max_iter": max(max_iter - result.n_iter, 0)}
+    end, found = _minimise_remainder(system, above, theta, limits, options)
+    if found.peaks.top >= result.peaks.top:
+        return theta, result
+    n_iter, history = result.n_iter + found.n_iter, result.history + found.history
+    return end, replace(found, n_iter=n_iter, history=history)
 
 
 def _from_least_squares(
@@ -440,7 +474,6 @@ def _left_saddle(
 
 def _minimise_remainder(
     system: ErrorSystem,
-    weight: Target | None,
     above: HinfObjective,
     theta0: Array,
     limits: Limits,
@@ -458,6 +491,7 @@ def _minimise_remainder(
         return options | {"tol": max(options["tol"], tol), "max_iter": most}
 
     grid, origin, history = system.grid, np.zeros(len(theta0)), []
+    weight = vanishing_weight(system, above.floor_frequency)
     if weight is not None:
         remainder, floor = system.reweighted(weight), above.floor
         bound = HinfObjective(remainder, theta0, above.T, limits, floor, system)

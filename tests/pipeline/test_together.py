@@ -1,10 +1,12 @@
 """A polynomial through the black boxes of all points."""
 
+import warnings
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lpvlearn import AutoLPV, GrayBoxStructure
+from lpvlearn import AutoLPV, GrayBoxStructure, SplineLPV
 from lpvlearn.models.statespace import DEVIATION
 from lpvlearn.pipeline.local_models import LocalModel
 from lpvlearn.pipeline.structured_models import StructuredModels
@@ -105,6 +107,23 @@ def test_a_form_that_the_black_boxes_refute_is_not_kept():
     with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
         form, _, _ = through_black_boxes(rough, structured(TRUTH, P))
     assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-5)
+
+
+@pytest.mark.parametrize("deviations", [0.0, 10.0])
+def test_parameters_near_a_form_that_foresees_no_more_are_on_a_smooth_function(
+    deviations,
+):
+    """A curve through the points is chosen then: that alone is no fault of theirs."""
+    theta, P = TRUTH.copy(), np.array([np.diag((STD * row) ** 2) for row in TRUTH])
+    theta[3] *= 1.0 + deviations * STD
+    through = AutoLPV().fit(KAPPA, theta, covariance=P)
+    curve = through.replaced("pchip", SplineLPV().fit(KAPPA, theta))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        form, _, _ = through_black_boxes(curve, structured(theta, P))
+    assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-4)
+    told = ["on no smooth function" in str(w.message) for w in caught]
+    assert told == [True] * (deviations > 0.0)
 
 
 def test_what_is_far_from_the_black_boxes_is_infinitely_far():

@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,6 +16,9 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, peak_gains
 from lpvlearn.datasets import FlexibleArm
 from lpvlearn.exceptions import RankWarning
+from lpvlearn.models.statespace import DEVIATION
+from lpvlearn.restructuring import estimator
+from lpvlearn.restructuring.minimise_hinf import minimise_hinf
 from lpvlearn.restructuring.problem import problem_from_models
 
 from ..conftest import spring_structure, stable_model
@@ -897,6 +901,35 @@ def test_a_fit_that_fails_leaves_no_attribute():
     after = vars(fitted)
     assert after.keys() == before.keys()
     assert all(after[name] is value for name, value in before.items())
+
+
+@pytest.mark.parametrize("norm", ["covariance", "hinf"])
+@pytest.mark.parametrize("std", [0.1, 1e-3])
+def test_a_stall_matters_where_its_end_is_used_or_nothing_else_confirms_it(
+    norm, std, monkeypatch
+):
+    """Efficient parameters that the noise explains do not hang on its last digits."""
+
+    def stalled(*args, **options):
+        theta, result, floor = minimise_hinf(*args, **options)
+        return theta, replace(result, stationarity=2e-3, converged=False), floor
+
+    monkeypatch.setattr(estimator, "minimise_hinf", stalled)
+    lag = GrayBoxStructure.from_template([["-a"]], [[2]], [[1]])
+    box, step = StateSpace(-2.0, 2.1, 1.0), DEVIATION * std
+    pairs = [
+        (StateSpace(-2.0 + step, 2.1, 1.0), StateSpace(-2.0 - step, 2.1, 1.0)),
+        (StateSpace(-2.0, 2.1 + step, 1.0), StateSpace(-2.0, 2.1 - step, 1.0)),
+    ]
+    given = {"estimates": [(box, pairs)]} if norm == "covariance" else {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fitted = GrayBoxRestructurer(lag, norm=norm).fit_model(box, **given)
+    told = any("the search stalled" in str(w.message) for w in caught)
+    assert told == (norm == "hinf" or std < 0.1)
+    assert fitted.convergence_ == "no"
+    if norm == "covariance":
+        assert (fitted.p_value_ > 0.1) == (std == 0.1)
 
 
 def test_a_parameter_of_zero_is_perturbed_too():

@@ -1,5 +1,6 @@
 """The H-infinity norm as a minimax problem, and the curves of its steps."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -194,3 +195,39 @@ def test_a_gain_whose_sign_is_wrong_vanishes(seed, dt):
     ended = 1e-6 if found.convergence_ == "no" else 1e-9
     assert 0.9 < found.relative_error_ <= 1.0 + ended
     assert found.lti_.is_stable
+
+
+RESONANCE = GrayBoxStructure.from_template(
+    [["-a", "-b"], [1, 0]], [["c"], [0]], [[1, 0]]
+)
+
+
+def beside_a_resonance(seed):
+    """A model whose gain at rest is not zero, as that of the structure is."""
+    rng, size = np.random.default_rng(seed), 4e-3
+    own = RESONANCE.model([2.0, 6.5, 20.0])
+    A = own.A + size * rng.normal(size=(2, 2))
+    B = own.B * (1.0 + size * rng.normal())
+    return StateSpace(A, B, own.C + size * rng.normal(size=(1, 2)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_search_that_comes_down_to_the_floor_is_at_an_optimum(seed):
+    box = beside_a_resonance(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fitted = GrayBoxRestructurer(RESONANCE).fit_model(box)
+    assert fitted.convergence_ == "optimal" and fitted.stationarity_ == 0.0
+    gain = abs(box.frequency_response(np.zeros(1)).item())
+    np.testing.assert_allclose(fitted.structural_floor_, gain, rtol=1e-9)
+    np.testing.assert_allclose(fitted.error_, gain, rtol=2e-6)
+    assert 0.0 < fitted.remaining_error_ < gain
+
+
+def test_what_remains_below_a_floor_is_minimised_from_where_it_was_met(monkeypatch):
+    box = beside_a_resonance(0)
+    found = GrayBoxRestructurer(RESONANCE).fit_model(box)
+    monkeypatch.setattr(minimise_hinf, "_gone_on", lambda _, *end: end[:2])
+    met = GrayBoxRestructurer(RESONANCE).fit_model(box)
+    assert found.remaining_error_ < 0.995 * met.remaining_error_
+    assert found.n_iter_ > met.n_iter_ and len(found.history_) > len(met.history_)
