@@ -409,7 +409,7 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
     else:
         remedy = "a higher `order`"
         if not chose_order:
-            remedy += " (of points that agree, or a structure, it is theirs)"
+            remedy += " (order='auto' finds it, but for one that all points share)"
         # Without figures, so that a search over orders says it once of each.
         telling.once(
             "lack",
