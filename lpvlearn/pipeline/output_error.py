@@ -43,7 +43,7 @@ from ..lpv.refinement import (
     squares,
     weights_of,
 )
-from ..lpv.weighting import covariance_of
+from ..lpv.weighting import covariance_of, is_chance
 from ..metrics.scores import best_fit
 from ..models.scheduling_range import grid_over
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -93,6 +93,10 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 # to the outputs, that are alike after steps that do not reach the end of a valley; and
 # orders that are tried beyond one that is as good, as a resonance has two states
 _ALIKE, _NEGLIGIBLE, _FURTHER = 1.1, 1e-3, 2
+
+# Part of what a beginning at rest misses that one held by the first inputs may miss,
+# and of its squares what is rounding
+_NEARER, _ROUNDING = 0.5, 1e-12
 
 _LOOKED_AT = 4  # experiments of an operating point: more tell the same of the errors
 
@@ -172,6 +176,8 @@ class OutputErrorLPV(ScheduledEstimator):
     ----------
     lpv_ : LPVStateSpace
         The refined model. Signals that `start` gives no names have those of the table.
+        Its `steady_start` is True where all experiments together begin nearer to where
+        their first inputs hold it than to rest.
     rate_ : bool
         Whether it has rate terms.
     coefficients_ : ndarray of shape (n_coefficients,)
@@ -337,6 +343,10 @@ class OutputErrorLPV(ScheduledEstimator):
         self._refine(start, experiments, dt, own)
         if own.constant and start.offsets is None:
             self.lpv_ = replace(self.lpv_, offsets=self._mean_offset())
+        if not self.lpv_.steady_start:
+            records = [_record(e, dt) for e in experiments]
+            steady = _begin_held(self.lpv_, records, own)
+            self.lpv_ = replace(self.lpv_, steady_start=steady)
         levels = grid_over(self.lpv_.scheduling_range, 3)
         longest = dt * max(len(e.rows) for e in experiments)
         growth_rates(self.lpv_, levels, longest, _UNSEEN)
@@ -757,6 +767,26 @@ def _asks_for_constants(
             found = refine(model, records, each, max_iter=_FIRST_STEPS).model
         left.append(squares(found, records, each, weight))
     return left[1] < CONSTANT * left[0]
+
+
+def _begin_held(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:
+    """Whether records begin where their first inputs hold the model, not at rest.
+
+    By the squared errors of both beginnings, above those of the initial states that
+    fit best.
+    """
+    if not own.initial_state:
+        return False
+    weight, known = weights_of(records), own._replace(initial_state=False)
+    at_rest, held = (
+        squares(replace(model.silenced(), steady_start=steady), records, known, weight)
+        for steady in (False, True)
+    )
+    least = squares(model.silenced(), records, own, weight)
+    if not held - least < _NEARER * (at_rest - least):
+        return False
+    variance = max(least, _ROUNDING * at_rest) / sum(r.y.size for r in records)
+    return not is_chance((at_rest - least) / variance, model.order * len(records))
 
 
 def _through(form: Any, found: StructuredModels, dt: float) -> LPVStateSpace:

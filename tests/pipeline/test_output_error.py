@@ -436,6 +436,39 @@ def test_states_that_move_are_no_more_states():
         assert bft_score(new + level * size, model.predict(fresh)) > 96.0
 
 
+def held_springs(n=2, before=10):
+    """Sweeps that begin where a force has held the spring for long."""
+    X, _ = sweeps(n=n, noise=0.0)
+    truth = replace(spring_lpv(), steady_start=True)
+    runs, outputs = [], []
+    for _, run in X.groupby("run"):
+        force = run["force"].to_numpy() + 3.0
+        force[:before] = 3.0
+        runs.append(run.assign(force=force))
+        y = truth.simulate(force, run["kappa"], 0.02)
+        outputs.append(pd.DataFrame({"position": y[:, 0]}))
+    return pd.concat(runs), pd.concat(outputs, ignore_index=True)
+
+
+def test_predictions_begin_as_the_experiments_do():
+    X, y = held_springs()
+    y = y + 0.03 * y.std().item() * np.random.default_rng(3).normal(size=y.shape)
+    model = OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X, y)
+    assert model.lpv_.steady_start
+    assert bft_score(y, model.predict(X)) > 95.0
+    at_rest = OutputErrorLPV(spring_lpv(), rate=False, initial_state="rest", **ROLES)
+    with collected():  # which they are not
+        assert not at_rest.fit(X, y).lpv_.steady_start
+
+
+def test_experiments_at_rest_begin_there(alone):
+    assert not alone.lpv_.steady_start
+    X, y = held_springs()
+    rest = y.assign(position=spring_lpv().simulate(X["force"], X["kappa"], 0.02)[:, 0])
+    model = OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X[:400], rest[:400])
+    assert not model.lpv_.steady_start
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable")  # as it is without them
 def test_constants_that_are_missing_are_told():
