@@ -94,6 +94,8 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 # orders that are tried beyond one that is as good, as a resonance has two states
 _ALIKE, _NEGLIGIBLE, _FURTHER = 1.1, 1e-3, 2
 
+_GROWN = 0.01  # share by which a model that grows does so over a record, at least
+
 # Part of what a beginning at rest misses that one held by the first inputs may miss,
 # and of its squares what is rounding
 _NEARER, _ROUNDING = 0.5, 1e-12
@@ -343,13 +345,14 @@ class OutputErrorLPV(ScheduledEstimator):
         self._refine(start, experiments, dt, own)
         if own.constant and start.offsets is None:
             self.lpv_ = replace(self.lpv_, offsets=self._mean_offset())
-        if not self.lpv_.steady_start:
+        levels = grid_over(self.lpv_.scheduling_range, 3)
+        longest = dt * max(len(e.rows) for e in experiments)
+        growth = growth_rates(self.lpv_, levels, longest, _UNSEEN)
+        # what grows, or hardly decays, no inputs hold
+        if not self.lpv_.steady_start and (growth < 0.0).all():
             records = [_record(e, dt) for e in experiments]
             steady = _begin_held(self.lpv_, records, own)
             self.lpv_ = replace(self.lpv_, steady_start=steady)
-        levels = grid_over(self.lpv_.scheduling_range, 3)
-        longest = dt * max(len(e.rows) for e in experiments)
-        growth_rates(self.lpv_, levels, longest, _UNSEEN)
         return self
 
     def refine(
@@ -736,11 +739,24 @@ def _promising(
         ends = [(*soon(model), model) for model in best]
         least, found, model = min(ends, key=lambda one: one[0])
         if len(orders) > 1:
-            least = soon(found)[0]
+            least, found = soon(found)
+            if _grows(found, records):
+                least /= CONSTANT
         tried.append((least, model))
         if _of_fewest_states(tried, records).order <= n - _FURTHER:
             break
     return tried
+
+
+def _grows(model: LPVStateSpace, records: Sequence[Record]) -> bool:
+    """Whether a frozen model grows over a record: free initial states allow that.
+
+    Simulations from elsewhere have to pay for it.
+    """
+    levels = grid_over(model.scheduling_range, 3)
+    poles = model.silenced().frozen_poles(levels)
+    longest = max(len(record.u) * record.dt for record in records)
+    return bool(poles.real.max(initial=0.0) * longest > _GROWN)
 
 
 def _of_fewest_states(
