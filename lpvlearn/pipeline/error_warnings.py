@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 # Errors that are told: constants, of a search of so many steps, leave less than this
 # share of their squares, or the inputs explain more than this share of the output.
-_CONSTANT, _STEPS, _OF_OUTPUT = 0.25, 15, 0.1
+CONSTANT, _STEPS, _OF_OUTPUT = 0.25, 15, 0.1
 
 # Errors with scheduling variables held, of those with them as measured, that are told
 _HELD, _SEEN = 0.7, 0.01  # and of the outputs
@@ -49,7 +49,7 @@ def tell_of_errors(
     if prior is not None:
         gain, left = _gains(start, records)
         i = int(np.argmin(np.where(np.abs(gain - 1.0) > _OF_OUTPUT, left, np.inf)))
-        if abs(gain[i] - 1.0) > _OF_OUTPUT and left[i] < _CONSTANT:
+        if abs(gain[i] - 1.0) > _OF_OUTPUT and left[i] < CONSTANT:
             warn(
                 f"output {names[i]!r} is {gain[i]:.3g} times what the model of the "
                 "local experiments simulates, but for "
@@ -66,7 +66,7 @@ def tell_of_errors(
             weight = weights_of(records)
             squared = squares(found, records, other, weight)
             share = squared / np.sum((np.vstack(errors) * weight) ** 2)
-            if share < _CONSTANT:
+            if share < CONSTANT:
                 warn(
                     "with a constant of every experiment and output the errors are "
                     f"at most {max(100.0 * np.sqrt(share), 0.1):.2g} % as large: a "

@@ -552,13 +552,16 @@ def _in_one_basis(
 
 
 def balanced_by_motion(
-    model: StateSpace, experiments: Sequence[Experiment]
+    model: StateSpace, experiments: Sequence[Experiment], order: int | None = None
 ) -> StateSpace:
-    """The model balanced for signals of about unit size; as it is where it grows."""
+    """The model balanced for signals of about unit size; as it is where it grows.
+
+    With as many states as `order` at most.
+    """
     if not model.is_stable:
         return model
     u, y = _sizes(experiments)
-    return scaled(scaled(model, u, y).balance(), 1.0 / u, 1.0 / y)
+    return scaled(scaled(model, u, y).balance(order), 1.0 / u, 1.0 / y)
 
 
 def _sizes(experiments: Sequence[Experiment]) -> tuple[Array, Array]:

@@ -43,7 +43,7 @@ from ..lpv.refinement import (
     squares,
     weights_of,
 )
-from ..lpv.weighting import covariance_of
+from ..lpv.weighting import covariance_of, is_chance
 from ..metrics.scores import best_fit
 from ..models.scheduling_range import grid_over
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -61,8 +61,8 @@ from ..validation import (
 from .bands import output_errors
 from .black_boxes import balanced_entries
 from .common_choices import common_delay, identify_points, of_structure
-from .error_warnings import tell_of_errors, tell_of_noisy_scheduling
-from .local_models import balanced_by_motion, identify_point
+from .error_warnings import CONSTANT, tell_of_errors, tell_of_noisy_scheduling
+from .local_models import LocalModel, balanced_by_motion, identify_point
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
@@ -88,6 +88,17 @@ _UNSEEN = "Where no experiment stays, nothing tells what the model does in the e
 # Parts of an experiment, each nearer to an operating point than the whole, of which
 # time-invariant models are made, too; how many of these are tried, by so many steps.
 _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
+
+# Of starts with several orders: squared errors, in the least ones, and errors relative
+# to the outputs, that are alike after steps that do not reach the end of a valley; and
+# orders that are tried beyond one that is as good, as a resonance has two states
+_ALIKE, _NEGLIGIBLE, _FURTHER = 1.1, 1e-3, 2
+
+_GROWN = 0.01  # share by which a model that grows does so over a record, at least
+
+# Part of what a beginning at rest misses that one held by the first inputs may miss,
+# and of its squares what is rounding
+_NEARER, _ROUNDING = 0.5, 1e-12
 
 _LOOKED_AT = 4  # experiments of an operating point: more tell the same of the errors
 
@@ -115,7 +126,8 @@ class OutputErrorLPV(ScheduledEstimator):
         from the table, or a part of an experiment, as if it were time-invariant, or one
         through the operating points at which experiments stay: in a structure, or
         without one (None) balanced, every entry of its matrices free; the one whose
-        first steps come farthest. A pipeline gives its own.
+        first steps come farthest. Without a structure, and an order of `local`, the
+        lowest that does as well as any. A pipeline gives its own.
     rate : {"auto", True, False}, default="auto"
         Whether A follows the rates of change of the scheduling variables too, by terms
         ``N_j(kappa) dkappa_j/dt`` in every row of A that holds parameters, quadratic
@@ -136,10 +148,13 @@ class OutputErrorLPV(ScheduledEstimator):
         structure, as in `LocalLPVPipeline`.
     initial_state : {"estimate", "rest"}, default="estimate"
         Whether the initial state of every experiment is unknown.
-    offset : {None, "constant"}, default=None
+    offset : {"auto", None, "constant"}, default="auto"
         "constant": every output of every experiment has an unknown constant. The model
         that `fit` gives has their mean as its `output_offset`, unless `start` has
         offsets; that of a pipeline, where they are the sensors', leaves them out.
+        "auto" takes constants where `start` is no LPV model, the time-invariant model
+        of the table has them, and they leave less than half of the errors; else none,
+        and none in a pipeline.
     inputs, scheduling, experiment, time : column name, position or list, default=None
         Roles of the columns of X, as in `LocalLPVPipeline`.
     sampling_time : float, default=None
@@ -163,6 +178,8 @@ class OutputErrorLPV(ScheduledEstimator):
     ----------
     lpv_ : LPVStateSpace
         The refined model. Signals that `start` gives no names have those of the table.
+        Its `steady_start` is True where all experiments together begin nearer to where
+        their first inputs hold it than to rest.
     rate_ : bool
         Whether it has rate terms.
     coefficients_ : ndarray of shape (n_coefficients,)
@@ -248,7 +265,7 @@ class OutputErrorLPV(ScheduledEstimator):
         interpolator: Any = None,
         local: Any = None,
         initial_state: str = "estimate",
-        offset: str | None = None,
+        offset: str | None = "auto",
         inputs: Any = None,
         scheduling: Any = None,
         experiment: Any = None,
@@ -317,7 +334,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self._remember_shape(y)
         self.output_names_, self.n_outputs_ = names, len(names)
         dt = self._sampling_time(experiments)
-        start, first = self._start(experiments, dt), experiments[0]
+        (start, own), first = self._start(experiments, dt), experiments[0]
         start = replace(
             start,
             scheduling_names=start.scheduling_names or first.scheduling_names or None,
@@ -325,12 +342,17 @@ class OutputErrorLPV(ScheduledEstimator):
             output_names=start.output_names or names,
             units={**(start.units or {}), **(self.units or {})} or None,
         )
-        self.refine(start, experiments, dt)
-        if self.offset == "constant" and start.offsets is None:
+        self._refine(start, experiments, dt, own)
+        if own.constant and start.offsets is None:
             self.lpv_ = replace(self.lpv_, offsets=self._mean_offset())
         levels = grid_over(self.lpv_.scheduling_range, 3)
         longest = dt * max(len(e.rows) for e in experiments)
-        growth_rates(self.lpv_, levels, longest, _UNSEEN)
+        growth = growth_rates(self.lpv_, levels, longest, _UNSEEN)
+        # what grows, or hardly decays, no inputs hold
+        if not self.lpv_.steady_start and (growth < 0.0).all():
+            records = [_record(e, dt) for e in experiments]
+            steady = _begin_held(self.lpv_, records, own)
+            self.lpv_ = replace(self.lpv_, steady_start=steady)
         return self
 
     def refine(
@@ -363,9 +385,22 @@ class OutputErrorLPV(ScheduledEstimator):
             If the start diverges on an experiment.
         """
         self._check_options()
+        own = _own_of(self)
+        return self._refine(start, experiments, sampling_time, own, known)
+
+    # -- helpers -------------------------------------------------------------------
+
+    def _refine(
+        self,
+        start: LPVStateSpace,
+        experiments: Sequence[Experiment],
+        sampling_time: float,
+        own: Own,
+        known: Prior | None = None,
+    ) -> OutputErrorLPV:
+        """As `refine`, with unknowns of every experiment that are decided."""
         start = replace(start, covariance=None)  # of coefficients that will be others
         records = [_record(e, sampling_time) for e in experiments]
-        own = _own_of(self)
         prior, factor = None, 1.0 if self.prior == "local" else self.prior
         if known is not None and factor is not None:
             more = np.zeros(len(coefficients_of(start)) - len(known.centre))
@@ -426,8 +461,6 @@ class OutputErrorLPV(ScheduledEstimator):
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self
 
-    # -- helpers -------------------------------------------------------------------
-
     @property
     def _splits(self) -> bool:
         return self.missing == "split"
@@ -449,8 +482,13 @@ class OutputErrorLPV(ScheduledEstimator):
             raise ValueError(NO_TIME.format("an LPV model is"))
         return positive_time("sampling_time", self.sampling_time)
 
-    def _start(self, experiments: Sequence[Experiment], dt: float) -> LPVStateSpace:
-        """The model given, or a time-invariant one in the form of an LPV model."""
+    def _start(
+        self, experiments: Sequence[Experiment], dt: float
+    ) -> tuple[LPVStateSpace, Own]:
+        """The model given, or a time-invariant one in the form of an LPV model.
+
+        And the unknowns of every experiment that go with it.
+        """
         names = experiments[0].scheduling_names
         if isinstance(self.start, LPVStateSpace):
             model = self.start
@@ -468,24 +506,32 @@ class OutputErrorLPV(ScheduledEstimator):
             if not isinstance(model.interpolator, Interpolator):
                 got = type(model.interpolator).__name__
                 raise ValueError(_NO_COEFFICIENTS.format("start", got))
-            return model
+            return model, _own_of(self)
         seen = np.zeros((1, 1))
         if names:
             seen = np.vstack([_record(e, dt).kappa for e in experiments])
         bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
-        groups = [experiments, *([part] for e in experiments for part in _parts_of(e))]
-        models: list[LPVStateSpace] = []
+        records = [_record(e, dt) for e in experiments]
         with collected():  # where a search begins, nobody needs to hear of
-            for group in groups:
-                try:
-                    models.append(self._constant_model(group, experiments, dt, bounds))
-                except ValueError:  # a part that tells too little
-                    if group is experiments:
-                        raise
+            local, most = of_structure(self._local(), self.start)
+            whole = _time_invariant(local, experiments, dt, most)
+            models = self._constant_models(whole, experiments, bounds)
+            plainer = _plainer(local, whole.order_of_rates)
+            for part in [part for e in experiments for part in _parts_of(e)]:
+                with suppress(ValueError):  # it tells too little
+                    found = _time_invariant(plainer, [part], dt, most)
+                    models += self._constant_models(found, [part], bounds)
             with suppress(ValueError):
                 models += self._through_points(experiments, dt, bounds)
-        records = [_record(e, dt) for e in experiments]
-        return _promising(models, records, _own_of(self))
+        own = _own_of(self)
+        if self.offset == "auto" and whole.n_trend:
+            with_constants = own._replace(constant=True)
+            tried = _promising(models, records, with_constants)
+            # slow states of a higher order would stand for constants
+            fewest = _of_fewest_states(tried, records, 1.0 / CONSTANT)
+            if _asks_for_constants(fewest, records, own):
+                return _of_fewest_states(tried, records), with_constants
+        return _of_fewest_states(_promising(models, records, own), records), own
 
     def _through_points(
         self, experiments: Sequence[Experiment], dt: float, bounds: Array
@@ -519,42 +565,41 @@ class OutputErrorLPV(ScheduledEstimator):
     def _local(self) -> Any:
         return SubspaceLTI(stability="enforce") if self.local is None else self.local
 
-    def _constant_model(
-        self,
-        identified: Sequence[Experiment],
-        experiments: Sequence[Experiment],
-        dt: float,
-        bounds: Array,
-    ) -> LPVStateSpace:
-        """One time-invariant model of some experiments, in the form of an LPV model."""
-        structure, names = self.start, experiments[0].scheduling_names
-        local, most = of_structure(self._local(), structure)
-        lti = identify_point(
-            local,
-            identified,
-            sampling_time=dt,
-            combine="pool",
-            discretization="zoh",
-            most=most,
-        ).lti
-        if structure is None:
-            lti = balanced_by_motion(lti, identified)
-            structure, (theta,) = balanced_entries([lti])
-        else:
-            theta = GrayBoxRestructurer(structure).fit_model(lti).params_
+    def _constant_models(
+        self, found: LocalModel, experiments: Sequence[Experiment], bounds: Array
+    ) -> list[LPVStateSpace]:
+        """The time-invariant model of some experiments, in the form of an LPV model.
+
+        And where the order is free what has fewer states: what moves looks like states
+        to a time-invariant model, but not along the scheduling variables.
+        """
+        structure, delay = self.start, found.lti.input_delay
         form = self.interpolator
         if form is None:
-            form = PolynomialLPV(1 if self.start is None else 2)
-        if not names:
+            form = PolynomialLPV(1 if structure is None else 2)
+        if not experiments[0].scheduling_names:
             form = PolynomialLPV(0)
         grid = grid_over(bounds, _LEVELS)
-        constant = clone(form).fit(grid, np.tile(theta, (len(grid), 1)))
-        return LPVStateSpace(structure, constant, bounds, input_delay=lti.input_delay)
+        if structure is None:
+            free = _is_free(self._local()) and found.lti.is_stable
+            orders = [*range(1, found.lti.order)] if free else []
+            entries = [
+                balanced_entries([balanced_by_motion(found.lti, experiments, order)])
+                for order in [*orders, None]
+            ]
+        else:
+            theta = GrayBoxRestructurer(structure).fit_model(found.lti).params_
+            entries = [(structure, theta[None])]
+        models = []
+        for structure, theta in entries:
+            constant = clone(form).fit(grid, np.tile(theta, (len(grid), 1)))
+            models.append(LPVStateSpace(structure, constant, bounds, input_delay=delay))
+        return models
 
     def _check_options(self) -> None:
         one_of("rate", self.rate, ("auto", True, False))
         one_of("initial_state", self.initial_state, ("estimate", "rest"))
-        one_of("offset", self.offset, (None, "constant"))
+        one_of("offset", self.offset, ("auto", None, "constant"))
         one_of("missing", self.missing, ("raise", "split"))
         units_by_name(self.units)
         verbosity(self.verbose)
@@ -620,23 +665,135 @@ def _parts_of(e: Experiment) -> list[Experiment]:
     return [part_of(e, slice(a, b)) for a, b in pairwise(ends) if b > a + 1]
 
 
+def _is_free(local: Any, name: str = "order") -> bool:
+    """Whether an option, the order, is left to an estimator."""
+    value = local.get_params(deep=False).get(name)
+    return isinstance(value, str) and value == "auto"
+
+
+def _time_invariant(
+    local: Any, experiments: Sequence[Experiment], dt: float, most: bool
+) -> LocalModel:
+    """A model of experiments as if they did not move; options as `identify_point`."""
+    return identify_point(
+        local,
+        experiments,
+        sampling_time=dt,
+        combine="pool",
+        discretization="zoh",
+        deviate=False,
+        most=most,
+    )
+
+
+def _plainer(local: Any, order: int) -> Any:
+    """The estimator for parts of experiments, where these only make more starts.
+
+    What was left to it, it need not weigh there: what each does along all of the
+    experiments tells.
+    """
+    if type(local) is not SubspaceLTI:
+        return local
+    plain = {"order": order, "method": "po-moesp", "offset": "constant"}
+    chosen = {name: v for name, v in plain.items() if _is_free(local, name)}
+    return clone(local).set_params(refine=False, **chosen)
+
+
+_Tried = list[tuple[float, LPVStateSpace]]  # errors of first steps, and start
+
+
 def _promising(
     models: Sequence[LPVStateSpace], records: Sequence[Record], own: Own
-) -> LPVStateSpace:
-    """The start of a search whose first steps come farthest."""
+) -> _Tried:
+    """The start of every order whose first steps come farthest, and how far.
+
+    From few states up, to some more than are as good as any.
+    """
     weight = weights_of(records)
 
     def loss(model: LPVStateSpace) -> float:
         return squares(model, records, own, weight)
 
-    def soon(model: LPVStateSpace) -> float:
+    def soon(model: LPVStateSpace) -> tuple[float, LPVStateSpace]:
         try:
-            return loss(refine(model, records, own, max_iter=_FIRST_STEPS).model)
+            found = refine(model, records, own, max_iter=_FIRST_STEPS).model
         except ValueError:  # it diverges, or has states too fast for its samples
-            return np.inf
+            return np.inf, model
+        return loss(found), found
 
-    best = sorted(models, key=loss)[:_N_STARTS]
-    return min(best, key=soon) if len(best) > 1 else best[0]
+    orders = sorted({model.order for model in models})
+    tried: _Tried = []
+    for n in orders:
+        best = sorted((m for m in models if m.order == n), key=loss)[:_N_STARTS]
+        if len(models) == 1:
+            return [(0.0, best[0])]
+        ends = [(*soon(model), model) for model in best]
+        least, found, model = min(ends, key=lambda one: one[0])
+        if len(orders) > 1:
+            least, found = soon(found)
+            if _grows(found, records):
+                least /= CONSTANT
+        tried.append((least, model))
+        if _of_fewest_states(tried, records).order <= n - _FURTHER:
+            break
+    return tried
+
+
+def _grows(model: LPVStateSpace, records: Sequence[Record]) -> bool:
+    """Whether a frozen model grows over a record: free initial states allow that.
+
+    Simulations from elsewhere have to pay for it.
+    """
+    levels = grid_over(model.scheduling_range, 3)
+    poles = model.silenced().frozen_poles(levels)
+    longest = max(len(record.u) * record.dt for record in records)
+    return bool(poles.real.max(initial=0.0) * longest > _GROWN)
+
+
+def _of_fewest_states(
+    tried: _Tried, records: Sequence[Record], alike: float = _ALIKE
+) -> LPVStateSpace:
+    """The start of the lowest order that comes about as far as any.
+
+    What more states gain is noise, and part of a way that a longer search goes.
+    """
+    negligible = _NEGLIGIBLE**2 * sum(record.y.size for record in records)
+    enough = alike * min(left for left, _ in tried) + negligible
+    return next(model for left, model in tried if left <= enough)
+
+
+def _asks_for_constants(
+    model: LPVStateSpace, records: Sequence[Record], own: Own
+) -> bool:
+    """Whether constants of the outputs leave little of the errors without them."""
+    weight, left = weights_of(records), []
+    for constant in (False, True):
+        each = own._replace(constant=constant)
+        found = model
+        with suppress(ValueError):  # it diverges
+            found = refine(model, records, each, max_iter=_FIRST_STEPS).model
+        left.append(squares(found, records, each, weight))
+    return left[1] < CONSTANT * left[0]
+
+
+def _begin_held(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:
+    """Whether records begin where their first inputs hold the model, not at rest.
+
+    By the squared errors of both beginnings, above those of the initial states that
+    fit best.
+    """
+    if not own.initial_state:
+        return False
+    weight, known = weights_of(records), own._replace(initial_state=False)
+    at_rest, held = (
+        squares(replace(model.silenced(), steady_start=steady), records, known, weight)
+        for steady in (False, True)
+    )
+    least = squares(model.silenced(), records, own, weight)
+    if not held - least < _NEARER * (at_rest - least):
+        return False
+    variance = max(least, _ROUNDING * at_rest) / sum(r.y.size for r in records)
+    return not is_chance((at_rest - least) / variance, model.order * len(records))
 
 
 def _through(form: Any, found: StructuredModels, dt: float) -> LPVStateSpace:

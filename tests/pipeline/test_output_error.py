@@ -374,7 +374,7 @@ def test_leaving_the_range_is_told(alone):
         ({"prior": -1.0}, "`prior` must be"),
         ({"start": "arx"}, "`start` must be"),
         ({"initial_state": "zero"}, "`initial_state` must be"),
-        ({"offset": "auto"}, "`offset` must be"),
+        ({"offset": "linear"}, "`offset` must be"),
         ({"missing": "drop"}, "`missing` must be"),
         ({"max_iter": 0}, "`max_iter` must be"),
         ({"interpolator": "auto"}, "`interpolator` must be an estimator or None. Got"),
@@ -413,15 +413,75 @@ def test_a_run_of_a_few_samples_is_fitted_with_the_others():
 
 
 @pytest.mark.slow
+def test_states_that_move_are_no_more_states():
+    """Of a time-invariant model they are, and slow ones would stand for constants."""
+    bounds = np.array([[0.0], [1.5]])
+    line = PolynomialLPV(1).fit(bounds, [[30, 1.2, 40], [30, 1.2, 160]])
+    truth = replace(spring_lpv(), interpolator=line)
+    X, fresh = sweeps(n_samples=500)[0], spring_sweep(500, seed=77)[0]
+    exact, new = (
+        np.concatenate(
+            [
+                truth.simulate(r[["force"]], r["kappa"], 0.02)
+                for _, r in x.groupby("run")
+            ]
+        )
+        for x in (X, fresh.assign(run="new"))
+    )
+    rng, size = np.random.default_rng(4), exact.std()
+    for noise, level in ((0.05, 5.0), (0.0, 0.0)):
+        y = exact + size * (noise * rng.standard_normal(exact.shape) + level)
+        model = OutputErrorLPV(rate=False, **ROLES).fit(X, y)
+        assert model.lpv_.order == 2
+        assert bft_score(new + level * size, model.predict(fresh)) > 96.0
+
+
+def held_springs(n=2, before=10):
+    """Sweeps that begin where a force has held the spring for long."""
+    X, _ = sweeps(n=n, noise=0.0)
+    truth = replace(spring_lpv(), steady_start=True)
+    runs, outputs = [], []
+    for _, run in X.groupby("run"):
+        force = run["force"].to_numpy() + 3.0
+        force[:before] = 3.0
+        runs.append(run.assign(force=force))
+        y = truth.simulate(force, run["kappa"], 0.02)
+        outputs.append(pd.DataFrame({"position": y[:, 0]}))
+    return pd.concat(runs), pd.concat(outputs, ignore_index=True)
+
+
+def test_predictions_begin_as_the_experiments_do():
+    X, y = held_springs()
+    y = y + 0.03 * y.std().item() * np.random.default_rng(3).normal(size=y.shape)
+    model = OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X, y)
+    assert model.lpv_.steady_start
+    assert bft_score(y, model.predict(X)) > 95.0
+    at_rest = OutputErrorLPV(spring_lpv(), rate=False, initial_state="rest", **ROLES)
+    with collected():  # which they are not
+        assert not at_rest.fit(X, y).lpv_.steady_start
+
+
+def test_experiments_at_rest_begin_there(alone):
+    assert not alone.lpv_.steady_start
+    X, y = held_springs()
+    rest = y.assign(position=spring_lpv().simulate(X["force"], X["kappa"], 0.02)[:, 0])
+    model = OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X[:400], rest[:400])
+    assert not model.lpv_.steady_start
+
+
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable")  # as it is without them
 def test_constants_that_are_missing_are_told():
     X, y = sweeps()
     roles = ROLES | {"experiment": "run"}
     off = y + y.std()
     with pytest.warns(UserWarning, match="Use offset='constant'"):
-        OutputErrorLPV(spring_structure(), **roles).fit(X, off)
-    found = OutputErrorLPV(spring_structure(), offset="constant", **roles).fit(X, off)
+        OutputErrorLPV(spring_structure(), offset=None, **roles).fit(X, off)
+    found = OutputErrorLPV(spring_structure(), **roles).fit(X, off)
     assert found.report_["BFT"].min() > 90.0
+    np.testing.assert_allclose(found.offsets_, y.std().item(), rtol=0.05)
+    # and none where there are none
+    assert not OutputErrorLPV(spring_structure(), **roles).fit(X, y).offsets_.any()
 
 
 @pytest.mark.parametrize("gain", [-1.0, 1000.0])
