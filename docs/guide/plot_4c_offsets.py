@@ -191,7 +191,7 @@ round(bft_score(data.y_large, y), 1)
 #   discharged by the current that excites it), what outputs at rest do with it,
 #   :math:`y_0(\kappa(t)) - y_0(\bar\kappa)`, is no mode of the plant: it is taken
 #   out of them where inputs stand at one level everywhere and the local models are
-#   likelier so (of up to a million samples).
+#   likelier so, and told (of up to a million samples).
 # * Constants that *differ* between experiments at one point are averaged, with a
 #   warning: the model cannot know which one comes next. If they belong to levels of
 #   another quantity, make that a scheduling variable.

@@ -52,8 +52,8 @@ def warn_extrapolation(
     low, high = identified_range
     width = np.where(high > low, high - low, 1.0)
     excess = np.maximum(low - kappa, kappa - high) / width
-    said = []
-    for j in np.flatnonzero((excess > _NEAR).any(axis=0)):
+    near, said = np.where(high > low, _NEAR, 0.0), []
+    for j in np.flatnonzero((excess > near).any(axis=0)):
         farthest = kappa[np.argmax(excess[:, j]), j]
         least, most, value = (
             number_shown(v, width[j]) for v in (low[j], high[j], farthest)

@@ -554,12 +554,11 @@ list, default=None
             )
             estimator = self._local()
             if self.offsets == "auto":
-                (local, kept), points = identified_as_held(
-                    points, partial(identify, estimator), runner
+                (local, kept), points, estimator = identified_as_held(
+                    estimator, points, identify, runner
                 )
             else:
                 local, kept = identify(estimator, points, runner)
-            take_back(LINE)  # the LPV model rests where it begins
             longest = self.sampling_time_ * kept.n_longest
             channels = experiments[0].input_names, self.output_names_
             wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
@@ -573,6 +572,7 @@ list, default=None
                     estimator = clone(estimator).set_params(order=order)
                     local, kept = identify(estimator, points, runner)
                 tell_of_integrators(local, self.output_names_, longest)
+            take_back(LINE)  # the LPV model rests where it begins
             points = kept
 
         with watch.step("restructuring", bar=True):  # step 4

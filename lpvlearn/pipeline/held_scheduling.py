@@ -11,10 +11,11 @@ subtracted where the models of the points are likelier without.
 
 What outputs stand at over the points tells how ``y0`` bends, if inputs stand at one
 level everywhere. Its slope at a point the experiments there tell better: that of
-``A(q) y = B(q) u + A(1) dy0/dkappa kappa + c``, of many lags, by linear least squares.
+``A(q) y = B(q) u + A(1) dy0/dkappa kappa + c``, of many lags, by linear least squares;
+where the two disagree, what they tell is noise, or something else.
 
-Not where the two disagree, or that follows the outputs themselves: what schedules
-itself is no motion beside the plant's, but its own.
+Not where that follows an output itself: what schedules itself is no motion beside the
+plant's, but its own.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from sklearn.base import clone
 
 from ..data.experiments import Experiment
 from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, repeat
+from ..exceptions import collected, repeat, warn
 from ..lpv.equilibria import STANDING
 from ..lpv.spline import SplineLPV
 from ..subspace.constants import CERTAIN
@@ -52,33 +54,51 @@ _MOST = 1_000_000  # samples, of tables that may lie on a disk
 
 
 def identified_as_held(
+    local: Any,
     points: OperatingPoints,
-    identify: Callable[[OperatingPoints, PointRunner], _Identified],
+    identify: Callable[[Any, OperatingPoints, PointRunner], _Identified],
     runner: PointRunner,
-) -> tuple[_Identified, OperatingPoints]:
-    """Models of the points that did not fail, and all points that they are of.
+) -> tuple[_Identified, OperatingPoints, Any]:
+    """Models of the points that did not fail, all points, and the estimator of both.
 
-    As if nothing had scheduled within these, where the models are likelier so.
+    As if nothing had scheduled within these, where the models are likelier so, and
+    told; all of them with constants then.
     """
     still = _held(points)
     if still is None:
-        return identify(points, runner), points
+        return identify(local, points, runner), points, local
+    constant = clone(local)
+    if constant.get_params(deep=False).get("offset") == "auto":
+        constant.set_params(offset="constant")
     held: _Identified = [], still
     with collected() as told_held, suppress(ValueError):
-        held = identify(still, replace(runner, verbose=0))
-    if len(held[0]) < len(points) or not any(model.n_trend for model in held[0]):
-        return identify(points, runner), points
+        held = identify(constant, still, replace(runner, verbose=0))
+    if not held[0] or not all(model.n_trend for model in held[0]):
+        return identify(local, points, runner), points, local
     own: _Identified = [], points
     with collected() as told, suppress(ValueError):
-        own = identify(points, runner)
-    if len(own[0]) == len(points):
-        pairs = zip(own[0], held[0], strict=True)
-        gain = sum(a.criterion - b.criterion for a, b in pairs)  # NaN: not told
-        if not gain > CERTAIN:
-            repeat(told)
-            return own, points
+        own = identify(local, points, runner)
+    pairs = zip(own[0], held[0], strict=False)
+    gain = sum(a.criterion - b.criterion for a, b in pairs)  # NaN: not told
+    n_own, n_held = len(own[0]), len(held[0])
+    if n_own > n_held or (n_own == n_held and not gain > CERTAIN):
+        repeat(told)
+        return own, points, local
     repeat(told_held)
-    return held, still
+    _tell(points)
+    return held, still, constant
+
+
+def _tell(points: OperatingPoints) -> None:
+    """Tell of models that lack what scheduling variables do within experiments."""
+    names = list(points.experiments[0][0].scheduling_names)
+    warn(
+        f"the scheduling variables, {names}, move within local experiments, and what "
+        "outputs at rest do with them was taken out: `local_models_` are those of "
+        "scheduling variables that stand still, and lack what inputs do through these; "
+        "`predict` has it from the scheduling values. Use offsets=None to keep the "
+        "experiments as they are."
+    )
 
 
 def _held(points: OperatingPoints) -> OperatingPoints | None:
@@ -96,38 +116,34 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
     if np.sum(np.var(levels / sizes[0], axis=0)) > STANDING:
         return None
     rest = SplineLPV(extrapolation="ignore").fit(points.kappa, outputs / sizes[1])
-    bends, changes = [], []
+    changes = []
     for group in points.experiments:
         bent = [_about_mean(rest.predict(run.kappa)) for run in group]
-        slope = _slope(group, [sizes[1] * bend for bend in bent])
-        for run, bend in zip(group, bent, strict=True):
-            bends.append(bend)
-            changes.append(bend + _about_mean(run.kappa) @ (slope / sizes[1]))
-    if not _is_motion(bends, changes, [run.measured / sizes[1] for run in runs]):
+        slope = _slope(group, [sizes[1] * bend for bend in bent]) / sizes[1]
+        added = [_about_mean(run.kappa) @ slope for run in group]
+        agrees = _square(added) < _ADDED**2 * _square(bent)
+        changes += [
+            bend + np.where(agrees, more, 0.0)
+            for bend, more in zip(bent, added, strict=True)
+        ]
+    moves = _moves(changes, [run.measured / sizes[1] for run in runs])
+    if not moves.any():
         return None
-    still = iter(changes)
-    groups = [
-        [_without(run, sizes[1] * next(still)) for run in group]
-        for group in points.experiments
-    ]
+    still = (np.where(moves, sizes[1] * change, 0.0) for change in changes)
+    groups = [[_without(run, next(still)) for run in g] for g in points.experiments]
     return replace(points, experiments=groups)
 
 
-def _is_motion(
-    bends: Sequence[Array], changes: Sequence[Array], outputs: Sequence[Array]
-) -> bool:
-    """Whether `changes` of the `outputs` are slow, and such as points let expect.
+def _moves(changes: Sequence[Array], outputs: Sequence[Array]) -> NDArray[np.bool_]:
+    """Which outputs do slowly what matters; none where that is most that one does.
 
-    By how y0 bends over these, all in units of the outputs' motion.
+    In units of the outputs' motion. What is larger than that motion they do not do.
     """
     size = np.max([change.std(axis=0) for change in changes], axis=0)
     slow = _step(changes) < np.minimum(_FAST * _step(outputs), _NOISY * size)
-    added = np.vstack(changes) - np.vstack(bends)
-    expected = np.sum(added**2) < _ADDED**2 * np.sum(np.vstack(bends) ** 2)
-    matters = size > _SLIGHT
-    return bool(
-        matters.any() and slow[matters].all() and expected and size.max() < _OWN
-    )
+    left = [y - change for y, change in zip(outputs, changes, strict=True)]
+    own = (size > _OWN) & (_about_means(left) < _about_means(outputs))
+    return (size > _SLIGHT) & (size < _OWN) & slow & ~own.any()
 
 
 def _without(run: Experiment, change: Array) -> Experiment:
@@ -169,6 +185,15 @@ def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> Array:
 
 def _about_mean(signal: Array) -> Array:
     return np.asarray(signal - signal.mean(axis=0)) if len(signal) else signal
+
+
+def _square(signals: Sequence[Array]) -> Array:
+    """Sum of squares of every column, NaN left out."""
+    return np.nansum(np.vstack(signals) ** 2, axis=0)
+
+
+def _about_means(signals: Sequence[Array]) -> Array:
+    return _square([signal - np.nanmean(signal, axis=0) for signal in signals])
 
 
 def _step(signals: Sequence[Array]) -> Array:

@@ -240,7 +240,12 @@ def tell_of_drift(fitted: LocalFit, outputs: Sequence[Array], telling: Telling) 
     ]
     left = [y - line for y, line in zip(outputs, lines, strict=True)]
     largest = np.max(np.abs([line[0] for line in lines]), axis=0)
-    share = largest / np.vstack([part - part.mean(axis=0) for part in left]).std(axis=0)
+    moves = np.vstack([part - part.mean(axis=0) for part in left]).std(axis=0)
+    # what does not move beside a drift, inputs do not move
+    known = moves > _EXPLAINED * np.max(
+        [np.abs(y).max(axis=0) for y in outputs], axis=0
+    )
+    share = np.where(known, largest / np.where(known, moves, 1.0), 0.0)
     if share.max() > _DRIFTS:
         i = int(share.argmax())
         telling.once(

@@ -84,3 +84,9 @@ def test_a_run_hardly_beyond_the_range_is_not_told(recwarn):
     assert not recwarn
     with pytest.warns(ExtrapolationWarning, match="2 of 3 samples .* at 2.02"):
         warn_extrapolation(np.array([[0.992], [1.5], [2.02]]), seen, ["k"])
+
+
+def test_beyond_a_single_point_everything_is_told():
+    point = np.full((2, 1), 1e-3)
+    with pytest.warns(ExtrapolationWarning, match="1 of 1 samples .* at 0.005"):
+        warn_extrapolation(np.array([[5e-3]]), point, ["k"])

@@ -51,7 +51,8 @@ def points_of(X, y):
 def test_outputs_that_follow_the_scheduling_are_no_mode_of_the_plant(seed):
     X, y = discharged(seed=seed)
     restructurer = GrayBoxRestructurer(CELL)
-    found = LocalLPVPipeline(restructurer=restructurer, **ROLES).fit(X, y)
+    with pytest.warns(UserWarning, match=r"\['charge'\], move within local"):
+        found = LocalLPVPipeline(restructurer=restructurer, **ROLES).fit(X, y)
     parameters = found.parameters_
     assert [model.order for model in found.local_models_] == [1] * len(LEVELS)
     np.testing.assert_allclose(parameters["a"], 0.05, rtol=0.01)
@@ -98,3 +99,23 @@ def test_noise_of_the_scheduling_stays():
     X, y = discharged(moved=0.0)
     X["charge"] += 0.01 * np.random.default_rng(0).standard_normal(len(X))
     assert _held(points_of(X, y)) is None
+
+
+def test_every_output_is_held_by_itself():
+    rng, (X, y) = np.random.default_rng(0), discharged()
+    other = X.assign(output=0.01 * X["current"] + rng.standard_normal(4)[X["run"]])
+    both = y.assign(other=other["output"] + 1e-4 * rng.standard_normal(len(y)))
+    (alone,), (beside,) = (
+        _held(points_of(X, some)).experiments[1] for some in (y, both)
+    )
+    np.testing.assert_allclose(beside.measured[:, 0], alone.measured[:, 0], atol=2e-4)
+
+
+def test_slopes_that_noise_tells_give_way_to_what_the_points_tell():
+    rng, (X, y) = np.random.default_rng(0), discharged()
+    clean = X["charge"]
+    X["charge"] = clean + 0.0015 * rng.standard_normal(len(X))
+    for run, group in enumerate(_held(points_of(X, y)).experiments):
+        moved = at_rest(clean[X["run"] == run].to_numpy())
+        left = group[0].measured[:, 0] - y["output"][X["run"] == run] + moved
+        assert np.std(left) < 0.4 * np.std(moved)
