@@ -50,6 +50,7 @@ _Identified: TypeAlias = "tuple[list[LocalModel], OperatingPoints]"
 _SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.5, 0.1, 0.5, 0.5
 
 _LAGS, _ROWS = 40, 4  # at most; and rows at least, for each parameter
+_RCOND = 1e-12  # of directions that the rows do not tell
 _MOST = 1_000_000  # samples, of tables that may lie on a disk
 
 
@@ -61,19 +62,22 @@ def identified_as_held(
 ) -> tuple[_Identified, OperatingPoints, Any]:
     """Models of the points that did not fail, all points, and the estimator of both.
 
-    As if nothing had scheduled within these, where the models are likelier so, and
-    told; all of them with constants then.
+    As if nothing had scheduled within these, where the models are likelier so. Then all
+    of them have constants, and it is told.
     """
     still = _held(points)
     if still is None:
         return identify(local, points, runner), points, local
-    constant = clone(local)
-    if constant.get_params(deep=False).get("offset") == "auto":
-        constant.set_params(offset="constant")
-    held: _Identified = [], still
-    with collected() as told_held, suppress(ValueError):
-        held = identify(constant, still, replace(runner, verbose=0))
-    if not held[0] or not all(model.n_trend for model in held[0]):
+    ways = [local]
+    if local.get_params(deep=False).get("offset") == "auto":
+        ways.append(clone(local).set_params(offset="constant"))
+    for way in ways:
+        held: _Identified = [], still
+        with collected() as told_held, suppress(ValueError):
+            held = identify(way, still, replace(runner, verbose=0))
+        if held[0] and all(model.n_trend for model in held[0]):
+            break
+    else:
         return identify(local, points, runner), points, local
     own: _Identified = [], points
     with collected() as told, suppress(ValueError):
@@ -86,7 +90,7 @@ def identified_as_held(
         return own, points, local
     repeat(told_held)
     _tell(points)
-    return held, still, constant
+    return held, still, way
 
 
 def _tell(points: OperatingPoints) -> None:
@@ -116,16 +120,22 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
     if np.sum(np.var(levels / sizes[0], axis=0)) > STANDING:
         return None
     rest = SplineLPV(extrapolation="ignore").fit(points.kappa, outputs / sizes[1])
-    changes = []
+    bends = [_about_mean(rest.predict(run.kappa)) for run in runs]
+    travelled = _square([_about_mean(run.kappa) for run in runs])
+    steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
+    beyond, added = iter(bends), []
     for group in points.experiments:
-        bent = [_about_mean(rest.predict(run.kappa)) for run in group]
-        slope = _slope(group, [sizes[1] * bend for bend in bent]) / sizes[1]
-        added = [_about_mean(run.kappa) @ slope for run in group]
-        agrees = _square(added) < _ADDED**2 * _square(bent)
-        changes += [
-            bend + np.where(agrees, more, 0.0)
-            for bend, more in zip(bent, added, strict=True)
-        ]
+        bent = [sizes[1] * next(beyond) for _ in group]
+        slope, variance = _slope(group, bent)
+        total = steep * sizes[1] ** 2 + variance  # of what it may be, and its error
+        slope *= 1.0 - variance / np.where(total > 0.0, total, 1.0)
+        slope /= sizes[1]
+        added += [_about_mean(run.kappa) @ slope for run in group]
+    agrees = _square(added) < _ADDED**2 * _square(bends)
+    changes = [
+        bend + np.where(agrees, more, 0.0)
+        for bend, more in zip(bends, added, strict=True)
+    ]
     moves = _moves(changes, [run.measured / sizes[1] for run in runs])
     if not moves.any():
         return None
@@ -152,10 +162,11 @@ def _without(run: Experiment, change: Array) -> Experiment:
     return replace(run, outputs=run.measured - change, scheduling=still)
 
 
-def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> Array:
+def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> tuple[Array, Array]:
     """Of outputs at rest over the scheduling variables, (n_scheduling, n_outputs).
 
-    At one point, beside what they bend. Zero where there are too few samples to tell.
+    At one point, beside what they bend; and its variance. Zero where there are too few
+    samples to tell.
     """
     n_scheduling, ny = group[0].kappa.shape[1], group[0].measured.shape[1]
     per_lag = ny + group[0].inputs.shape[1]
@@ -163,7 +174,7 @@ def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> Array:
     lags = (sum(lengths) // _ROWS - n_scheduling) // per_lag
     lags = min(_LAGS, lags, max(lengths) // _ROWS)
     if lags < 1:
-        return np.zeros((n_scheduling, ny))
+        return np.zeros((n_scheduling, ny)), np.zeros((n_scheduling, ny))
     causes, effects = [], []
     for run, bend in zip(group, bends, strict=True):
         if len(run.rows) <= lags + 1:
@@ -175,12 +186,23 @@ def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> Array:
         known = np.isfinite(rows).all(axis=1) & np.isfinite(y[lags:]).all(axis=1)
         causes.append(_about_mean(rows[known]))
         effects.append(_about_mean(y[lags:][known]))
-    H = np.vstack(causes)
+    H, Y = np.vstack(causes), np.vstack(effects)
     size = np.linalg.norm(H, axis=0)
     size[size == 0.0] = 1.0
-    found = np.linalg.lstsq(H / size, np.vstack(effects))[0] / size[:, None]
-    of_past = found[: per_lag * lags].reshape(per_lag, lags, ny)[:ny].sum(axis=1)
-    return np.linalg.lstsq((np.eye(ny) - of_past).T, found[-n_scheduling:].T)[0].T
+    inverse = np.linalg.pinv(H / size, rcond=_RCOND) / size[:, None]
+    found = inverse @ Y
+    noise = (Y - H @ found).T @ (Y - H @ found) / max(len(H) - H.shape[1], 1)
+    # of all lags of every output, and of the scheduling variables
+    sums = np.zeros((ny + n_scheduling, H.shape[1]))
+    sums[:ny, : ny * lags] = np.kron(np.eye(ny), np.ones(lags))
+    sums[ny:, -n_scheduling:] = np.eye(n_scheduling)
+    of_past, of_kappa = np.split(sums @ found, [ny])
+    settled = np.linalg.pinv(np.eye(ny) - of_past)
+    slope = of_kappa @ settled
+    # d slope = (d of_kappa + slope d of_past) settled
+    moves = np.hstack([slope, np.eye(n_scheduling)]) @ sums @ inverse
+    spread = np.sum(moves**2, axis=1)[:, None] * np.diag(settled.T @ noise @ settled)
+    return slope, spread
 
 
 def _about_mean(signal: Array) -> Array:

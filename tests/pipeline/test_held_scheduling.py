@@ -67,8 +67,9 @@ def test_slope_is_exact_without_noise():
         (run,) = group
         charge = run.kappa.mean()
         curve = 0.9 + 2.0 * 0.3 * charge
-        slope = _slope(group, [np.zeros_like(run.measured)])
+        slope, variance = _slope(group, [np.zeros_like(run.measured)])
         np.testing.assert_allclose(slope, curve, rtol=1e-3)
+        assert variance < 1e-6
 
 
 def test_held_experiments_lack_only_what_the_scheduling_moved():
