@@ -140,17 +140,6 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 
-def of_one_method(local: Any, models: Sequence[LocalModel]) -> Any:
-    """A clone of the estimator with the method that all models took, of its own choice.
-
-    What to identify again for other choices need not look for that.
-    """
-    methods, estimator = {model.method for model in models}, clone(local)
-    if len(methods) == 1 and local.get_params(deep=False).get("method") == "auto":
-        estimator.set_params(method=methods.pop())
-    return estimator
-
-
 def _spread(n_points: int, most: int) -> list[int]:
     """Some of the points, from the first to the last."""
     return np.unique(np.linspace(0, n_points - 1, most).round().astype(int)).tolist()
@@ -311,8 +300,7 @@ def _drifting_alike(
     doubtful = [m.lasts or (m.n_trend < 2 and m.order_of_rates > most) for m in models]
     if not any(doubtful) and len(models) == len(found):
         return found
-    drifting = of_one_method(local, models).set_params(offset="linear")
-
+    drifting = clone(local).set_params(offset="linear")
     if not models and tried(drifting, [0])[0] is None:
         return found
 

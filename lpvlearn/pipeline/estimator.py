@@ -58,8 +58,8 @@ from ..validation import (
     verbosity,
 )
 from .black_boxes import channel_sizes, foreseen_order
-from .common_choices import common_delay, identify_points, of_one_method
-from .held_scheduling import identified_as_held
+from .common_choices import common_delay, identify_points
+from .held_scheduling import identified_as_held, tell_of_held
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
 from .local_models import LocalModel, estimates_outputs, tell_of_integrators
@@ -552,7 +552,7 @@ list, default=None
                 efficient=self.efficient or efficient,
                 deviate=self._needs_deviations(),
             )
-            estimator = self._local()
+            estimator, whole = self._local(), points
             if self.offsets == "auto":
                 (local, kept), points, estimator = identified_as_held(
                     estimator, points, identify, runner
@@ -573,6 +573,8 @@ list, default=None
                     local, kept = identify(estimator, points, runner)
                 tell_of_integrators(local, self.output_names_, longest)
             take_back(LINE)  # the LPV model rests where it begins
+            if points is not whole:
+                tell_of_held(experiments[0].scheduling_names)
             points = kept
 
         with watch.step("restructuring", bar=True):  # step 4
@@ -899,11 +901,13 @@ def _foreseen_order(
     if not isinstance(getattr(estimator, "order", None), str):
         return None
 
-    chosen = of_one_method(estimator, local)
+    chosen, methods = {}, {model.method for model in local}
+    if len(methods) == 1 and getattr(estimator, "method", None) == "auto":
+        chosen["method"] = methods.pop()  # looked for once
 
     def identified(order: int) -> list[LocalModel]:
         with collected(), suppress(ValueError):
-            found, kept = identify(clone(chosen).set_params(order=order))
+            found, kept = identify(clone(estimator).set_params(order=order, **chosen))
             return found if len(kept) == len(points) else []
         return []
 

@@ -20,7 +20,7 @@ plant's, but its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeAlias
@@ -63,7 +63,7 @@ def identified_as_held(
     """Models of the points that did not fail, all points, and the estimator of both.
 
     As if nothing had scheduled within these, where the models are likelier so. Then all
-    of them have constants, and it is told.
+    of them have constants.
     """
     still = _held(points)
     if still is None:
@@ -89,16 +89,14 @@ def identified_as_held(
         repeat(told)
         return own, points, local
     repeat(told_held)
-    _tell(points)
     return held, still, way
 
 
-def _tell(points: OperatingPoints) -> None:
+def tell_of_held(names: Sequence[Hashable]) -> None:
     """Tell of models that lack what scheduling variables do within experiments."""
-    names = list(points.experiments[0][0].scheduling_names)
     warn(
-        f"the scheduling variables, {names}, move within local experiments, and what "
-        "outputs at rest do with them was taken out: `local_models_` are those of "
+        f"the scheduling variables, {list(names)}, move within local experiments, and "
+        "what outputs at rest do with them was taken out: `local_models_` are those of "
         "scheduling variables that stand still, and lack what inputs do through these; "
         "`predict` has it from the scheduling values. Use offsets=None to keep the "
         "experiments as they are."
