@@ -121,8 +121,10 @@ pipeline.refiner_.rate_, pipeline.lpv_
 # Alone, the estimator begins with one time-invariant model of the table: in a
 # structure, or without one as a balanced model with matrices affine in the scheduling
 # variables; or, where experiments of the table stay at three operating points or more,
-# with the model through these, as a pipeline makes it. What it needs then is data that
-# tell all coefficients:
+# with the model through these, as a pipeline makes it. Without a structure it has the
+# fewest states that do about as well as any, and outputs have constants where these
+# leave little of the errors (``offset="auto"``). What it needs then is data that tell
+# all coefficients:
 #
 # .. code-block:: python
 #

@@ -167,6 +167,7 @@ def test_experiments_that_start_at_rest_have_zero_initial_states(rng):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Output 2 drifts along a line")  # of four samples
 def test_knowing_that_short_experiments_start_at_rest_helps(rng):
     errors = {"rest": [], "estimate": []}
     truth, omega = StateSpace(*SYSTEM, 1.0), np.linspace(0.05, 3.0, 20)

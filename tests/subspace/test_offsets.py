@@ -376,6 +376,7 @@ def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Output 1 drifts along a line")
 @pytest.mark.parametrize("size", [0.5, 10.0])
 @pytest.mark.parametrize("every", [1, 10])
 def test_a_drift_is_not_followed_by_a_state(size, every):
