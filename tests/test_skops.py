@@ -98,6 +98,7 @@ def test_splines_over_two_variables_come_back_to_the_bit():
     comes_back(SplineLPV().fit(kappa, THETA), kappa + 0.01)
 
 
+@pytest.mark.filterwarnings("ignore:Output 'position' drifts along a line")
 @pytest.mark.parametrize(
     "options", [{}, {"refine": "simulation"}, {"method": "pi-moesp"}], ids=str
 )
