@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.metrics import r2_score
 
-from ..exceptions import DivergenceError, collected, warn
+from ..exceptions import DivergenceError, VersionedPickle, collected, warn
 from ..validation import SQUARED, squarable, weights
 from .alignment import align_outputs
+from .containers import OutputContainer
 from .tables import read_outputs
 
 Array = NDArray[np.float64]
@@ -35,8 +37,10 @@ _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
 
 
-class ScoredFromRest:
-    """An estimator whose score is that of a simulation from rest.
+class ScoredFromRest(
+    OutputContainer, VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator
+):
+    """A regressor of tables whose score is that of a simulation from rest.
 
     It tells of motion, and of outputs left out.
     """

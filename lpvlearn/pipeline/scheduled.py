@@ -8,16 +8,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.containers import OutputContainer
 from ..data.experiments import Experiment, read_experiments
 from ..data.preparation import read_runs
 from ..data.scoring import ScoredFromRest
 from ..data.tables import n_rows_of
 from ..data.timestamps import check_unit
-from ..exceptions import VersionedPickle
 from ..lpv.extrapolation import warn_extrapolation
 from ..lpv.model import LPVStateSpace
 from ..metrics.table_simulation import simulate_experiments
@@ -28,15 +25,7 @@ from .workers import end_what_begins_with_this_process
 Array = NDArray[np.float64]
 
 
-class ScheduledEstimator(
-    OutputContainer,
-    ScoredFromRest,
-    VersionedPickle,
-    MultiOutputMixin,
-    RegressorMixin,
-    BaseEstimator,
-    ABC,
-):
+class ScheduledEstimator(ScoredFromRest, ABC):
     """Simulates tables with the model `lpv_` that an heir fits to one."""
 
     sampling_time: float | None

@@ -10,11 +10,10 @@ from typing import Any, Self, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
+from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.alignment import align_outputs
-from ..data.containers import OutputContainer
 from ..data.experiments import (
     OPTIONAL_ROLES,
     Experiment,
@@ -27,7 +26,7 @@ from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
 from ..data.scoring import ScoredFromRest
 from ..data.tables import Table, n_rows_of, read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
+from ..exceptions import all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.threads import one_blas_thread
@@ -101,14 +100,7 @@ _TAKEN = (
 )
 
 
-class SubspaceLTI(
-    OutputContainer,
-    ScoredFromRest,
-    VersionedPickle,
-    MultiOutputMixin,
-    RegressorMixin,
-    BaseEstimator,
-):
+class SubspaceLTI(ScoredFromRest):
     """Linear time-invariant state-space model by subspace identification.
 
     The observability matrix is estimated from compressed block-Hankel data by one of
