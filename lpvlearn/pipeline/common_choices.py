@@ -24,7 +24,13 @@ from ..structures.structure import GrayBoxStructure
 from ..subspace.criterion import PRICE
 from ..subspace.delay import with_late_inputs
 from ..subspace.estimator import SubspaceLTI
-from .local_models import LocalModel, identify_point, integrates, labels_of
+from .local_models import (
+    LocalModel,
+    identify_point,
+    integrates,
+    is_left,
+    labels_of,
+)
 from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
@@ -54,7 +60,7 @@ def identify_points(
     `identify_point`.
     """
     given = local.get_params(deep=False).get("order")
-    free = isinstance(given, str) and given == "auto"
+    free = is_left(local, "order")
     chooses = free or isinstance(given, range | list | tuple | np.ndarray)
     local, options["most"] = of_structure(local, structure)
     # Where a record stood in the table does not matter: splits share their results.
@@ -101,7 +107,7 @@ def identify_points(
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
         some = _spread(len(groups), _SCOUTS)
         scouts = tried(local, some, known) if search else []
-        if local.get_params(deep=False).get("offset") == "auto":
+        if is_left(local, "offset"):
             # whatever the others are, but where drifts are what all of them lack
             fails = scouts and not any(scouts) and runner.on_error == "raise"
             found = known if fails else _of_own_orders(local, attempted, scouts, known)
@@ -130,9 +136,7 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
 
     And whether a model may have fewer states, as `identify_point` asks.
     """
-    given = local.get_params(deep=False).get("order")
-    free = isinstance(given, str) and given == "auto"
-    if not (free and isinstance(structure, GrayBoxStructure)):
+    if not (is_left(local, "order") and isinstance(structure, GrayBoxStructure)):
         return local, False
     # the model of the rates has not the integrators, no model what nothing shows
     lost = integrators if integrates(local) else hidden_integrators

@@ -62,7 +62,7 @@ from .common_choices import common_delay, identify_points
 from .held_scheduling import identified_as_held, tell_of_held
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
-from .local_models import LocalModel, estimates_outputs, tell_of_integrators
+from .local_models import LocalModel, estimates_outputs, is_left, tell_of_integrators
 from .memory import checked_memory
 from .mislabelled import tell_of_mislabelled
 from .output_error import (
@@ -198,7 +198,8 @@ list, default=None
         follows these, interpolated by a cubic spline through the points (see Notes),
         with the slopes that the models' gains tell where they are of one system.
         None: its outputs are zero at rest at input zero, with a warning where the
-        experiments speak against it.
+        experiments speak against it; and what outputs at rest do as scheduling
+        variables move within experiments is left in these.
     efficient : bool, default=True
         Weigh by the noise: the outputs in the local models, and in step 4 the response
         by the covariance of the black box, begun at the H-infinity optimum, as
@@ -898,11 +899,11 @@ def _foreseen_order(
     identify: Callable[[Any], tuple[list[LocalModel], OperatingPoints]],
 ) -> int | None:
     """As `foreseen_order`; None where the estimator has no order to choose."""
-    if not isinstance(getattr(estimator, "order", None), str):
+    if not is_left(estimator, "order"):
         return None
 
     chosen, methods = {}, {model.method for model in local}
-    if len(methods) == 1 and getattr(estimator, "method", None) == "auto":
+    if len(methods) == 1 and is_left(estimator, "method"):
         chosen["method"] = methods.pop()  # looked for once
 
     def identified(order: int) -> list[LocalModel]:

@@ -37,7 +37,7 @@ from ..lpv.equilibria import STANDING
 from ..lpv.spline import SplineLPV
 from ..subspace.constants import CERTAIN
 from .black_boxes import channel_sizes
-from .local_models import LocalModel, motions
+from .local_models import LocalModel, is_left, motions
 from .runner import PointRunner
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def identified_as_held(
     if still is None:
         return identify(local, points, runner), points, local
     ways = [local]
-    if local.get_params(deep=False).get("offset") == "auto":
+    if is_left(local, "offset"):
         ways.append(clone(local).set_params(offset="constant"))
     for way in ways:
         held: _Identified = [], still

@@ -244,6 +244,12 @@ def labels_of(experiments: Sequence[Experiment]) -> list[Hashable]:
     return list(dict.fromkeys(e.label for e in experiments))
 
 
+def is_left(local: Any, name: str) -> bool:
+    """Whether an estimator is to choose an option itself ("auto")."""
+    value = local.get_params(deep=False).get(name)
+    return isinstance(value, str) and value == "auto"
+
+
 def integrates(local: Any) -> bool:
     """Whether an estimator identifies the rates of outputs, and integrates them."""
     return getattr(local, "integrating", None) is not None

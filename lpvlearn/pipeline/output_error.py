@@ -62,10 +62,10 @@ from .bands import output_errors
 from .black_boxes import balanced_entries
 from .common_choices import common_delay, identify_points, of_structure
 from .error_warnings import CONSTANT, tell_of_errors, tell_of_noisy_scheduling
-from .local_models import LocalModel, balanced_by_motion, identify_point
+from .local_models import LocalModel, balanced_by_motion, identify_point, is_left
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
-from .stability import growth_rates
+from .stability import grows, growth_rates
 from .steps import check_step
 from .structured_models import (
     StructuredModels,
@@ -93,8 +93,6 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 # to the outputs, that are alike after steps that do not reach the end of a valley; and
 # orders that are tried beyond one that is as good, as a resonance has two states
 _ALIKE, _NEGLIGIBLE, _FURTHER = 1.1, 1e-3, 2
-
-_GROWN = 0.01  # share by which a model that grows does so over a record, at least
 
 # Part of what a beginning at rest misses that one held by the first inputs may miss,
 # and of its squares what is rounding
@@ -507,11 +505,9 @@ class OutputErrorLPV(ScheduledEstimator):
                 got = type(model.interpolator).__name__
                 raise ValueError(_NO_COEFFICIENTS.format("start", got))
             return model, _own_of(self)
-        seen = np.zeros((1, 1))
-        if names:
-            seen = np.vstack([_record(e, dt).kappa for e in experiments])
-        bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
         records = [_record(e, dt) for e in experiments]
+        seen = np.vstack([r.kappa for r in records]) if names else np.zeros((1, 1))
+        bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
         with collected():  # where a search begins, nobody needs to hear of
             local, most = of_structure(self._local(), self.start)
             whole = _time_invariant(local, experiments, dt, most)
@@ -581,7 +577,7 @@ class OutputErrorLPV(ScheduledEstimator):
             form = PolynomialLPV(0)
         grid = grid_over(bounds, _LEVELS)
         if structure is None:
-            free = _is_free(self._local()) and found.lti.is_stable
+            free = is_left(self._local(), "order") and found.lti.is_stable
             orders = [*range(1, found.lti.order)] if free else []
             entries = [
                 balanced_entries([balanced_by_motion(found.lti, experiments, order)])
@@ -665,12 +661,6 @@ def _parts_of(e: Experiment) -> list[Experiment]:
     return [part_of(e, slice(a, b)) for a, b in pairwise(ends) if b > a + 1]
 
 
-def _is_free(local: Any, name: str = "order") -> bool:
-    """Whether an option, the order, is left to an estimator."""
-    value = local.get_params(deep=False).get(name)
-    return isinstance(value, str) and value == "auto"
-
-
 def _time_invariant(
     local: Any, experiments: Sequence[Experiment], dt: float, most: bool
 ) -> LocalModel:
@@ -695,7 +685,7 @@ def _plainer(local: Any, order: int) -> Any:
     if type(local) is not SubspaceLTI:
         return local
     plain = {"order": order, "method": "po-moesp", "offset": "constant"}
-    chosen = {name: v for name, v in plain.items() if _is_free(local, name)}
+    chosen = {name: v for name, v in plain.items() if is_left(local, name)}
     return clone(local).set_params(refine=False, **chosen)
 
 
@@ -709,6 +699,8 @@ def _promising(
 
     From few states up, to some more than are as good as any.
     """
+    if len(models) == 1:
+        return [(0.0, models[0])]
     weight = weights_of(records)
 
     def loss(model: LPVStateSpace) -> float:
@@ -721,33 +713,22 @@ def _promising(
             return np.inf, model
         return loss(found), found
 
+    longest = max(len(record.u) * record.dt for record in records)
     orders = sorted({model.order for model in models})
     tried: _Tried = []
     for n in orders:
         best = sorted((m for m in models if m.order == n), key=loss)[:_N_STARTS]
-        if len(models) == 1:
-            return [(0.0, best[0])]
         ends = [(*soon(model), model) for model in best]
         least, found, model = min(ends, key=lambda one: one[0])
         if len(orders) > 1:
             least, found = soon(found)
-            if _grows(found, records):
+            # free initial states allow that: simulations from elsewhere pay for it
+            if grows(found, grid_over(found.scheduling_range, 3), longest):
                 least /= CONSTANT
         tried.append((least, model))
         if _of_fewest_states(tried, records).order <= n - _FURTHER:
             break
     return tried
-
-
-def _grows(model: LPVStateSpace, records: Sequence[Record]) -> bool:
-    """Whether a frozen model grows over a record: free initial states allow that.
-
-    Simulations from elsewhere have to pay for it.
-    """
-    levels = grid_over(model.scheduling_range, 3)
-    poles = model.silenced().frozen_poles(levels)
-    longest = max(len(record.u) * record.dt for record in records)
-    return bool(poles.real.max(initial=0.0) * longest > _GROWN)
 
 
 def _of_fewest_states(

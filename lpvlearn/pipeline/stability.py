@@ -78,6 +78,11 @@ def growth_rates(
     return rates
 
 
+def grows(lpv: LPVStateSpace, kappa: Array, longest: float) -> bool:
+    """Whether a frozen model at a value grows over a record (seconds); not told."""
+    return bool((_rates(lpv.silenced(), kappa, _GROWN / longest) > 0.0).any())
+
+
 def _rates(model: LPVStateSpace, kappa: Array, least: float) -> Array:
     """Largest real part of the poles at every value; 0 up to `least`, and rounding."""
     poles = model.frozen_poles(kappa)

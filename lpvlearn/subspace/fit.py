@@ -105,7 +105,7 @@ def fit_samples(
         fitted = moved_back(fitted, first, differ)
     if detrend is not None:
         fitted = fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
-    if choices.offset == "auto":
+    if choices.offset == "auto" and not telling.silent:
         tell_of_drift(fitted, outputs, telling)
     return fitted, samples
 
