@@ -14,7 +14,7 @@ from ..data.preparation import read_runs
 from ..data.tables import Table, as_numbers, read_outputs
 from ..metrics.scorers import unwrap
 from ..subspace import SubspaceLTI
-from ..subspace.residuals import (
+from ..subspace.evidence.residuals import (
     Residuals,
     autocorrelations,
     check_kind,

@@ -21,9 +21,9 @@ from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, warn
 from ..restructuring.known_poles import hidden_integrators, integrators
 from ..structures.structure import GrayBoxStructure
-from ..subspace.criterion import PRICE
-from ..subspace.delay import with_late_inputs
 from ..subspace.estimator import SubspaceLTI
+from ..subspace.fits.delay import with_late_inputs
+from ..subspace.simulation_error.criterion import PRICE
 from .local_models import (
     LocalModel,
     identify_point,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.refinement import Own, Prior, Record, refine, squares, weights_of
-from ..subspace.residuals import explained_by_inputs
+from ..subspace.evidence.residuals import explained_by_inputs
 
 Array = NDArray[np.float64]
 

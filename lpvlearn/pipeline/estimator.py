@@ -44,9 +44,9 @@ from ..metrics.reports import readable_report
 from ..metrics.scorers import InitialState
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
+from ..subspace.diagnosis.fit_warnings import LINE
 from ..subspace.estimator import SubspaceLTI
-from ..subspace.fit_warnings import LINE
-from ..subspace.integrating import integrating_flags
+from ..subspace.fits.integrating import integrating_flags
 from ..systems.threads import one_blas_thread
 from ..systems.whole_files import whole_file
 from ..validation import (

@@ -35,7 +35,7 @@ from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, repeat, warn
 from ..lpv.equilibria import STANDING
 from ..lpv.spline import SplineLPV
-from ..subspace.constants import CERTAIN
+from ..subspace.evidence.constants import CERTAIN
 from .black_boxes import channel_sizes
 from .local_models import LocalModel, is_left, motions
 from .runner import PointRunner

@@ -25,8 +25,8 @@ from ..models.statespace import (
     scaled,
 )
 from ..restructuring.minimise_covariance import Estimate
-from ..subspace.constants import CERTAIN
-from ..subspace.integrating import integrating_flags
+from ..subspace.evidence.constants import CERTAIN
+from ..subspace.fits.integrating import integrating_flags
 from ..systems.modes import lasting, n_changes
 
 Array = NDArray[np.float64]

@@ -37,9 +37,9 @@ from ..structures.map import AffineMap, FixedMap, FunctionMap, RowsMap, Structur
 from ..structures.mechanical import FluxMap, ImplicitMap
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..subspace.integrating import RateEvidence
-from ..subspace.offsets import Offsets
-from ..subspace.statistics import Evidence, Known
+from ..subspace.evidence.offsets import Offsets
+from ..subspace.evidence.statistics import Evidence, Known
+from ..subspace.fits.integrating import RateEvidence
 from .estimator import LocalLPVPipeline
 from .output_error import OutputErrorLPV
 

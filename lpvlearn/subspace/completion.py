@@ -9,9 +9,12 @@ import numpy as np
 from ..data.experiments import Experiment
 from ..data.preparation import has_gaps
 from ..exceptions import DivergenceError
-from .criterion import EXACT, n_parameters
-from .delay import Delay
-from .local_fit import LocalFit
+from .evidence.statistics import Evidence
+from .fits.delay import Delay
+from .fits.local_fit import LocalFit
+from .fits.one_fit import TooFewSamples
+from .fits.options import Choices
+from .fits.simulator import Simulator
 from .missing_outputs import (
     by_prediction,
     by_simulation,
@@ -22,12 +25,9 @@ from .missing_outputs import (
     runs_to_complete,
     warn_of_few,
 )
-from .one_fit import TooFewSamples
-from .options import Choices
-from .selection import MAX_ORDER
-from .simulation_fit import simulation_errors
-from .simulator import Simulator
-from .statistics import Evidence
+from .orders.selection import MAX_ORDER
+from .simulation_error.criterion import EXACT, n_parameters
+from .simulation_error.simulation_fit import simulation_errors
 from .telling import Telling
 
 # Missing outputs are estimated in so many rounds at most, until they move by less than

@@ -32,12 +32,20 @@ from ..models.statespace import ModelPair, StateSpace
 from ..systems.threads import one_blas_thread
 from ..validation import frequencies, naming_argument, one_of
 from .completion import completed, completed_by
-from .cross_checks import tell_of_delay
-from .delay import Delay, delays_of, with_late_inputs
+from .diagnosis.cross_checks import tell_of_delay
+from .diagnosis.fit_warnings import TESTS, warn_about
+from .diagnosis.horizons import warn_about_horizon
+from .evidence.offsets import Offsets, of_rates
+from .evidence.residuals import (
+    Residuals,
+    check_kind,
+    input_labels,
+    model_residuals,
+    residual_tests,
+)
 from .fit import fit_samples
-from .fit_warnings import TESTS, warn_about
-from .horizons import warn_about_horizon
-from .integrating import (
+from .fits.delay import Delay, delays_of, with_late_inputs
+from .fits.integrating import (
     RateEvidence,
     integrated,
     integrating_flags,
@@ -48,11 +56,9 @@ from .integrating import (
     warn_if_useless,
     without_direct,
 )
-from .local_fit import LocalFit
-from .missing_outputs import warn_of_many_pieces
-from .offsets import Offsets, of_rates
-from .one_fit import Samples
-from .options import (
+from .fits.local_fit import LocalFit
+from .fits.one_fit import Samples
+from .fits.options import (
     Choices,
     check_for_completion,
     check_for_rates,
@@ -60,16 +66,10 @@ from .options import (
     choices_of_each,
     choices_of_stream,
 )
-from .residuals import (
-    Residuals,
-    check_kind,
-    input_labels,
-    model_residuals,
-    residual_tests,
-)
-from .selection import selection_text
-from .simulator import Simulator
-from .stream import SampleStream, fit_as_stream
+from .fits.simulator import Simulator
+from .missing_outputs import warn_of_many_pieces
+from .orders.selection import selection_text
+from .streams.stream import SampleStream, fit_as_stream
 from .telling import Telling
 
 Array = NDArray[np.float64]

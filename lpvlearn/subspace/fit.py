@@ -11,11 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import check_excitation, remove_trends
-from .answers import tell_of_answering_input
-from .at_rest import from_rest, moved_back
-from .cross_checks import tell_of_contradiction, tell_of_input_spikes
-from .drift import of_drifting_noise
-from .fit_warnings import (
+from .alternatives.at_rest import from_rest, moved_back
+from .alternatives.drift import of_drifting_noise
+from .alternatives.noise_levels import as_given, by_own_noise
+from .alternatives.oscillations import without_modes_of_few_lines, without_oscillations
+from .alternatives.rivals import (
+    Doubt,
+    believable,
+    held_by_a_loop,
+    may_be_held,
+    may_share_noise,
+    tell_of_lead,
+    with_shared_noise,
+)
+from .alternatives.rounded_inputs import without_rounding
+from .alternatives.shifts import without_shifts
+from .alternatives.trends import with_trends
+from .closed_loop.answers import tell_of_answering_input
+from .diagnosis.cross_checks import tell_of_contradiction, tell_of_input_spikes
+from .diagnosis.fit_warnings import (
     tell_of_answers,
     tell_of_drift,
     tell_of_dropouts,
@@ -25,22 +39,8 @@ from .fit_warnings import (
     tell_of_logging,
     tell_of_still_outputs,
 )
-from .local_fit import LocalFit
-from .noise_levels import as_given, by_own_noise
-from .one_fit import Samples, TooFewSamples
-from .oscillations import without_modes_of_few_lines, without_oscillations
-from .rivals import (
-    Doubt,
-    believable,
-    held_by_a_loop,
-    may_be_held,
-    may_share_noise,
-    tell_of_lead,
-    with_shared_noise,
-)
-from .rounded_inputs import without_rounding
-from .shifts import without_shifts
-from .trends import with_trends
+from .fits.local_fit import LocalFit
+from .fits.one_fit import Samples, TooFewSamples
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from ..data.preparation import complete_runs, part_of
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..systems.least_squares import scaled_lstsq
-from .noise import expected_change, expected_noise, noise_of
+from .simulation_error.noise import expected_change, expected_noise, noise_of
 from .telling import Telling
 
 Array = NDArray[np.float64]

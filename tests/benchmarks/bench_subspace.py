@@ -18,11 +18,11 @@ from unittest import mock
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from lpvlearn.subspace import identification
-from lpvlearn.subspace.hankel import _hankel_matrix, data_factors
-from lpvlearn.subspace.records import scale_records
-from lpvlearn.subspace.selection import select
-from lpvlearn.subspace.simulation_fit import Freedom
+from lpvlearn.subspace.orders.realization import identification
+from lpvlearn.subspace.orders.selection import select
+from lpvlearn.subspace.samples.hankel import _hankel_matrix, data_factors
+from lpvlearn.subspace.samples.records import scale_records
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
 
 try:

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from lpvlearn import SubspaceLTI
 from lpvlearn.inspection import ResidualDisplay
-from lpvlearn.subspace.residuals import autocorrelations, cross_correlations
+from lpvlearn.subspace.evidence.residuals import autocorrelations, cross_correlations
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes

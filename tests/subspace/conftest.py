@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from lpvlearn.subspace import identification
-from lpvlearn.subspace import stream as stream_module
-from lpvlearn.subspace import stream_summary as summary_module
-from lpvlearn.subspace.records import scale_records
-from lpvlearn.subspace.simulation_fit import Freedom
+from lpvlearn.subspace.orders import identification
+from lpvlearn.subspace.samples.records import scale_records
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom
+from lpvlearn.subspace.streams import stream as stream_module
+from lpvlearn.subspace.streams import stream_summary as summary_module
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
-from lpvlearn.subspace.answers import answering_input
+from lpvlearn.subspace.closed_loop.answers import answering_input
 
 # numerator and denominator of the controller's law
 LAWS = {

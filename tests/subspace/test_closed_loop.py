@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
-from lpvlearn.subspace.closed_loop import _Changes, _Innovation, _riccati_gain
+from lpvlearn.subspace.closed_loop.pbsid import _Changes, _Innovation, _riccati_gain
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes

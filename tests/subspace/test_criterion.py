@@ -7,9 +7,12 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI, load, save
-from lpvlearn.subspace.criterion import criterion_of
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import Realization, with_initial_states
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.criterion import criterion_of
+from lpvlearn.subspace.simulation_error.simulation_fit import (
+    Realization,
+    with_initial_states,
+)
 
 from ..conftest import modes
 from .conftest import example, experiment, freedom

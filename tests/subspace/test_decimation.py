@@ -5,10 +5,10 @@ from scipy import linalg, signal
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace.decimation import SlowStarts, decimated, full_rate
-from lpvlearn.subspace.identification import Settings
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import Freedom
+from lpvlearn.subspace.orders.decimation import SlowStarts, decimated, full_rate
+from lpvlearn.subspace.orders.identification import Settings
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom
 
 STEP = 0.006  # seconds: some five hundred samples in a period of the faster mode
 

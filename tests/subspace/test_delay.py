@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.models.innovation import InnovationModel, NoiseModel
-from lpvlearn.subspace.delay import find_delays, first_answers, late_inputs
-from lpvlearn.subspace.options import Choices
+from lpvlearn.subspace.fits.delay import find_delays, first_answers, late_inputs
+from lpvlearn.subspace.fits.options import Choices
 
 from ..conftest import stable_model
 

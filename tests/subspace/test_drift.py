@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import drift, trends
-from lpvlearn.subspace.drift import differences, of_levels
-from lpvlearn.subspace.one_fit import Samples
-from lpvlearn.subspace.options import Choices
-from lpvlearn.subspace.statistics import StaticGain
+from lpvlearn.subspace.alternatives import drift, trends
+from lpvlearn.subspace.alternatives.drift import differences, of_levels
+from lpvlearn.subspace.evidence.statistics import StaticGain
+from lpvlearn.subspace.fits.one_fit import Samples
+from lpvlearn.subspace.fits.options import Choices
 from lpvlearn.subspace.telling import Telling
 
 

@@ -13,10 +13,10 @@ from lpvlearn import StateSpace, SubspaceLTI, bft_score
 from lpvlearn.data.faulty_signals import drops_out, stays_put
 from lpvlearn.data.preparation import remove_trends
 from lpvlearn.exceptions import RankWarning
+from lpvlearn.subspace.diagnosis.fit_warnings import warn_about
 from lpvlearn.subspace.fit import fit_samples
-from lpvlearn.subspace.fit_warnings import warn_about
-from lpvlearn.subspace.one_fit import Samples
-from lpvlearn.subspace.options import Choices, check_options
+from lpvlearn.subspace.fits.one_fit import Samples
+from lpvlearn.subspace.fits.options import Choices, check_options
 from lpvlearn.subspace.telling import Telling
 from lpvlearn.systems.simulation import lti_response
 

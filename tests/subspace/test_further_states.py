@@ -5,10 +5,10 @@ import pandas as pd
 import pytest
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.further_states import FurtherStates
-from lpvlearn.subspace.identification import Settings
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import Freedom, simulation_fit
+from lpvlearn.subspace.orders.further_states import FurtherStates
+from lpvlearn.subspace.orders.identification import Settings
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom, simulation_fit
 
 
 def test_what_one_pole_of_the_grid_leaves_out_is_found_exactly():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lpvlearn.subspace.hankel import (
+from lpvlearn.subspace.samples.hankel import (
     _hankel_gram,
     _hankel_matrix,
     _past_future_rows,

@@ -5,9 +5,9 @@ import pytest
 from scipy import linalg
 from scipy.signal import lfilter, place_poles
 
-from lpvlearn.subspace.held_out import HeldOut, Part, held_out
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import Realization
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.held_out import HeldOut, Part, held_out
+from lpvlearn.subspace.simulation_error.simulation_fit import Realization
 
 from ..conftest import modes
 from .conftest import POLES, example, experiment

@@ -5,11 +5,15 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI, bft_score
-from lpvlearn.subspace.identification import Candidate, Settings, _is_astray
-from lpvlearn.subspace.noise import Whitening
-from lpvlearn.subspace.realization import METHODS
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import simulation_fit
+from lpvlearn.subspace.orders.identification import (
+    Candidate,
+    Settings,
+    _is_astray,
+)
+from lpvlearn.subspace.orders.realization import METHODS
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.noise import Whitening
+from lpvlearn.subspace.simulation_error.simulation_fit import simulation_fit
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -83,7 +87,7 @@ def test_feedthrough_off_fixes_D_at_zero(rng):
 @pytest.mark.parametrize("engine", ["cholesky", "qr"])
 def test_order_zero_is_the_least_squares_gain(rng, engine, monkeypatch):
     if engine == "qr":
-        refused = "lpvlearn.subspace.hankel.cholesky_factor"
+        refused = "lpvlearn.subspace.samples.hankel.cholesky_factor"
         monkeypatch.setattr(refused, lambda gram, **_: None)
     u = rng.standard_normal((50, 2))
     y = u @ rng.standard_normal((2, 3)) + 0.1 * rng.standard_normal((50, 3))

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.linearity import _large_changes, find_bend
+from lpvlearn.subspace.evidence.linearity import _large_changes, find_bend
 
 from ..conftest import modes, spring_tables
 from .test_residuals import coloured

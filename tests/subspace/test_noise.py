@@ -7,7 +7,8 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.models.innovation import NoiseModel
-from lpvlearn.subspace.noise import (
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.noise import (
     Whitening,
     autoregression,
     expected_change,
@@ -15,8 +16,7 @@ from lpvlearn.subspace.noise import (
     reduced_noise_model,
     spectral_density,
 )
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.simulation_fit import (
+from lpvlearn.subspace.simulation_error.simulation_fit import (
     Freedom,
     Realization,
     simulation_errors,

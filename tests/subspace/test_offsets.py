@@ -10,11 +10,16 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import constants, hankel
-from lpvlearn.subspace.constants import _tail, stands_by_chance, without_slow_modes
-from lpvlearn.subspace.offsets import attributed, far_off
-from lpvlearn.subspace.records import Record, centred
-from lpvlearn.subspace.simulation_fit import (
+from lpvlearn.subspace.evidence import constants
+from lpvlearn.subspace.evidence.constants import (
+    _tail,
+    stands_by_chance,
+    without_slow_modes,
+)
+from lpvlearn.subspace.evidence.offsets import attributed, far_off
+from lpvlearn.subspace.samples import hankel
+from lpvlearn.subspace.samples.records import Record, centred
+from lpvlearn.subspace.simulation_error.simulation_fit import (
     Freedom,
     Realization,
     _general_regression,

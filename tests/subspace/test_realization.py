@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from lpvlearn.subspace.hankel import data_factors
-from lpvlearn.subspace.realization import (
+from lpvlearn.subspace.orders.realization import (
     observability_subspace,
     reflect_unstable,
     shift_invariant_pair,
 )
+from lpvlearn.subspace.samples.hankel import data_factors
 
 from ..conftest import modes
 from .conftest import POLES, example, experiment, sorted_poles

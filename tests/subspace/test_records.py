@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lpvlearn.subspace.records import (
+from lpvlearn.subspace.samples.records import (
     Record,
     centred,
     scale_records,

@@ -5,13 +5,13 @@ import pytest
 from scipy.linalg import block_diag
 
 from lpvlearn import StateSpace
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.recursive_refinement import (
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.simulation_fit import simulation_fit
+from lpvlearn.subspace.streams.recursive_refinement import (
     _aligned_pair,
     input_matrices,
     start_recursion,
 )
-from lpvlearn.subspace.simulation_fit import simulation_fit
 
 from .conftest import freedom, record
 

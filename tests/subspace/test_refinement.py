@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.refinement import refine_simulation
-from lpvlearn.subspace.simulation_fit import simulation_fit
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.refinement import refine_simulation
+from lpvlearn.subspace.simulation_error.simulation_fit import simulation_fit
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes

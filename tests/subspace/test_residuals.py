@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.signal.windows import tukey
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.residuals import (
+from lpvlearn.subspace.evidence.residuals import (
     Fitted,
     Residuals,
     _sensitivities,
@@ -374,7 +374,7 @@ def test_long_records_are_worked_on_in_pieces(monkeypatch):
     rng = np.random.default_rng(11)
     e, u = coloured(rng, 500, 0.5, 2), held(rng, 500, 2)
     whole = table_of([e], [u])
-    monkeypatch.setattr("lpvlearn.subspace.residuals._PIECE", 64)
+    monkeypatch.setattr("lpvlearn.subspace.evidence.residuals._PIECE", 64)
     assert_allclose(table_of([e], [u])["p_value"], whole["p_value"], rtol=1e-9)
 
 

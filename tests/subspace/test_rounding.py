@@ -7,8 +7,8 @@ import pytest
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.rounding import Rounding
+from lpvlearn.subspace.evidence.rounding import Rounding
+from lpvlearn.subspace.samples.records import Record
 
 
 @pytest.mark.parametrize("step", [1e-6, 0.1, 3.0, 1e5])

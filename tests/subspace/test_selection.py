@@ -8,14 +8,15 @@ from scipy.signal import butter, lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import fit_warnings, selection
-from lpvlearn.subspace.held_out import HeldOut, Part
-from lpvlearn.subspace.identification import Settings
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.selection import (
+from lpvlearn.subspace.diagnosis import fit_warnings
+from lpvlearn.subspace.orders import selection
+from lpvlearn.subspace.orders.identification import Settings
+from lpvlearn.subspace.orders.selection import (
     _horizon_grid,
     select,
 )
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.held_out import HeldOut, Part
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes, stable_model

@@ -9,11 +9,19 @@ from numpy.testing import assert_allclose
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
-from lpvlearn.subspace import shifts
-from lpvlearn.subspace.one_fit import Samples
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.shifts import _statistics, cut_at, find_shifts
-from lpvlearn.subspace.varx import find_feedback, longest_past, regression_of
+from lpvlearn.subspace.alternatives import shifts
+from lpvlearn.subspace.alternatives.shifts import (
+    _statistics,
+    cut_at,
+    find_shifts,
+)
+from lpvlearn.subspace.closed_loop.varx import (
+    find_feedback,
+    longest_past,
+    regression_of,
+)
+from lpvlearn.subspace.fits.one_fit import Samples
+from lpvlearn.subspace.samples.records import Record
 
 
 def slow_record(rng, n=1200, noise=0.03):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.signals import (
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.signals import (
     SharedSignals,
     block_sections,
     section_states,

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from lpvlearn.subspace.records import Record
-from lpvlearn.subspace.signals import block_sections, signal_factor
-from lpvlearn.subspace.simulation_fit import (
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.signals import block_sections, signal_factor
+from lpvlearn.subspace.simulation_error.simulation_fit import (
     _general_regression,
     _solve_regressions,
     linear_regression,

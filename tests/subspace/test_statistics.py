@@ -7,11 +7,11 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.simulation_fit import Freedom, Realization
-from lpvlearn.subspace.statistics import (
+from lpvlearn.subspace.evidence.statistics import (
     _frequency_response_jacobian,
     _pole_jacobian,
 )
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom, Realization
 from lpvlearn.systems.simulation import lti_response, state_trajectory
 
 OMEGA = np.array([0.1, 0.5, 1.0, 2.0])

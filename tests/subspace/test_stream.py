@@ -11,9 +11,13 @@ from sklearn.exceptions import NotFittedError
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.exceptions import RankWarning
-from lpvlearn.subspace import stream as stream_module
-from lpvlearn.subspace.hankel import data_factors, extend_hankel_sum, start_hankel_sum
-from lpvlearn.subspace.realization import METHODS, factor_input_matrices
+from lpvlearn.subspace.orders.realization import METHODS, factor_input_matrices
+from lpvlearn.subspace.samples.hankel import (
+    data_factors,
+    extend_hankel_sum,
+    start_hankel_sum,
+)
+from lpvlearn.subspace.streams import stream as stream_module
 from lpvlearn.systems.simulation import lti_response
 
 from .conftest import fed, freedom, identify, record
@@ -421,7 +425,7 @@ def test_errors_of_the_linear_algebra_are_not_taken_for_few_samples(
     u, y = record(system, 900)
     model = SubspaceLTI(5, horizon=8).partial_fit(u[:300], y[:300])
     with monkeypatch.context() as patched:
-        patched.setattr("lpvlearn.subspace.one_fit.identify", diverge)
+        patched.setattr("lpvlearn.subspace.fits.one_fit.identify", diverge)
         refused(model, u[300:], y[300:], "did not converge")
     model.partial_fit(u[300:], y[300:])
     whole = SubspaceLTI(5, horizon=8).fit(u, y)

@@ -1,0 +1,1 @@
+"""Samples of a plant in a loop: noticed, and identified nevertheless."""

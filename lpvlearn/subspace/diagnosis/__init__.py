@@ -1,0 +1,1 @@
+"""What is said of a fit: what the samples lack, and what is wrong with the model."""

@@ -1,0 +1,1 @@
+"""What the errors of a fitted model tell of it and of the samples."""

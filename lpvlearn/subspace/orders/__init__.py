@@ -1,0 +1,1 @@
+"""Models of every order from the compressed samples, and the choice among them."""

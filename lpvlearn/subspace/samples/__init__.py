@@ -1,0 +1,1 @@
+"""What fits see of experiments, and its compression."""

@@ -1,0 +1,1 @@
+"""Models by least squares on the simulation error, and the noise in it."""

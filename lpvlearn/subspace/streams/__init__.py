@@ -1,0 +1,1 @@
+"""Fits of batches that come one by one, in memory that does not grow."""
