@@ -44,7 +44,7 @@ from ..metrics.reports import readable_report
 from ..metrics.scorers import InitialState
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
-from ..subspace.diagnosis.fit_warnings import LINE
+from ..subspace.diagnosis.faulty_outputs import LINE
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.fits.integrating import integrating_flags
 from ..systems.threads import one_blas_thread

@@ -29,16 +29,15 @@ from .alternatives.shifts import without_shifts
 from .alternatives.trends import with_trends
 from .closed_loop.answers import tell_of_answering_input
 from .diagnosis.cross_checks import tell_of_contradiction, tell_of_input_spikes
-from .diagnosis.fit_warnings import (
-    tell_of_answers,
+from .diagnosis.faulty_outputs import (
     tell_of_drift,
     tell_of_dropouts,
-    tell_of_feedback,
     tell_of_held_outputs,
     tell_of_limits,
     tell_of_logging,
     tell_of_still_outputs,
 )
+from .diagnosis.loop_warnings import tell_of_answers, tell_of_feedback
 from .fits.local_fit import LocalFit
 from .fits.one_fit import Samples, TooFewSamples
 

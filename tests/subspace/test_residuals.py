@@ -1,8 +1,5 @@
 """Residual tests: exact regressions, uniform p-values, and the power to see."""
 
-import re
-import warnings
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,6 +10,7 @@ from scipy.signal import lfilter
 from scipy.signal.windows import tukey
 
 from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.subspace.evidence.regressions import whitening_filters
 from lpvlearn.subspace.evidence.residuals import (
     Fitted,
     Residuals,
@@ -22,7 +20,6 @@ from lpvlearn.subspace.evidence.residuals import (
     input_tests,
     residual_tests,
     whiteness_tests,
-    whitening_filters,
     with_windows,
 )
 from lpvlearn.systems.simulation import lti_response
@@ -472,37 +469,6 @@ def test_a_fit_tells_of_missing_states():
     with pytest.warns(UserWarning, match="order 2 lacks states.*order='auto'"):
         SubspaceLTI(2, horizon=12).fit(u, y)
     SubspaceLTI(4, horizon=12).fit(u, y)  # silently
-
-
-def test_spikes_that_follow_moves_of_the_input_are_no_sensors():
-    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 20), 40)[:, None]
-    late = np.vstack([np.zeros((3, 1)), u[:-3]])
-    y = lfilter([0.5], [1.0, -0.5], late, axis=0)
-    y += 0.002 * np.random.default_rng(1).standard_normal(y.shape)
-    told = "stand far out .* Most come right after inputs move: .* `input_delay`"
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        SubspaceLTI(1, refine="simulation").fit(u, y)
-    assert any(re.search(told, str(w.message)) for w in caught)
-
-
-def test_spikes_are_told_and_where_the_farthest_is():
-    rng = np.random.default_rng(3)
-    u = rng.standard_normal((600, 2))
-    y = lfilter([0.0, 1.0], [1.0, -0.8], u, axis=0)
-    for noise in (coloured(rng, 1200, 0.9), rng.laplace(size=1200)):
-        SubspaceLTI(2, horizon=8).fit(u, y + 0.1 * noise.reshape(y.shape))  # silently
-    y += 0.1 * rng.standard_normal(y.shape)
-    y[[50, 350, 431], 1] += [3.0, -2.0, 4.0]
-    runs = np.repeat([0.0, 1.0], 300)[:, None]
-    expected = (
-        r"3 sample.* of output 2 .*sample 131 of experiment 1,.*missing='estimate'"
-    )
-    with pytest.warns(UserWarning, match=expected):
-        SubspaceLTI(2, horizon=8, experiment=2).fit(np.hstack([u, runs]), y)
-    y[[50, 350, 431], 1] = np.nan
-    for missing in ("split", "estimate"):
-        SubspaceLTI(2, horizon=8, missing=missing).fit(u, y)  # silently
 
 
 def test_a_small_lack_is_not_told():

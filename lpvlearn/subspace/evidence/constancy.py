@@ -24,7 +24,7 @@ from ..simulation_error.simulation_fit import (
     simulation_fit,
     with_initial_states,
 )
-from .residuals import filtered, whitening_filters
+from .regressions import filtered, whitening_filters
 from .statistics import Evidence
 
 Array = NDArray[np.float64]

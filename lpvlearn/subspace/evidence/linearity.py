@@ -36,17 +36,15 @@ from ...systems.threads import one_blas_thread
 from ..samples.records import Record, thinned
 from ..simulation_error.noise import through_filter
 from ..simulation_error.simulation_fit import Realization, simulation_errors
-from .residuals import (
-    BEYOND_CHANCE,
+from .regressions import (
     DEPENDENT,
-    N_LAGS,
-    WINDOWS_PER_LAG,
     f_test,
     of_size_one,
     through_modes,
     whitening_filters,
     without,
 )
+from .residuals import BEYOND_CHANCE, N_LAGS, WINDOWS_PER_LAG
 from .statistics import Evidence
 
 Array = NDArray[np.float64]

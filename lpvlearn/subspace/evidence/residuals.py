@@ -44,7 +44,6 @@ from ...data.preparation import DETRENDS, remove_trends
 from ...exceptions import warn
 from ...models.innovation import InnovationModel
 from ...models.statespace import StateSpace, unknown_responses
-from ...systems.beginnings import moves_of
 from ...systems.least_squares import diagonal_scale
 from ...systems.simulation import (
     estimate_initial_state,
@@ -56,8 +55,18 @@ from ...systems.threads import one_blas_thread
 from ...validation import one_of, share, whole_number
 from ..samples.hankel import correlation_sequence, factor_of_pieces
 from ..samples.records import centred, thinned
-from ..simulation_error.noise import autoregression, through_filter, whitening_filter
+from ..simulation_error.noise import through_filter
 from ..simulation_error.simulation_fit import simulation_errors
+from .regressions import (
+    DEPENDENT,
+    ResidualTest,
+    f_test,
+    filtered,
+    of_size_one,
+    through_modes,
+    whitening_filters,
+    without,
+)
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -71,10 +80,6 @@ WINDOWS_PER_LAG = 10
 # The same for a number of lags that the user wants, and for each sensitivity: so many,
 # that a fair F test remains.
 _FEWEST_WINDOWS = 2
-
-# Part of a regressor's size that others do not explain, below which it is taken for a
-# combination of them: inputs of a few sines, or held for many samples.
-DEPENDENT = 1e-4
 
 # Errors that are rounding, relative to the spread of the output: 24-bit converters and
 # single precision resolve 6e-8.
@@ -90,24 +95,10 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 
 # A lack is told that is all of this:
 _MUCH = 0.03  # of the squared errors, at least
-_MUCH_OF_OUTPUT = 0.003  # of the output, root mean square, at least
+MUCH_OF_OUTPUT = 0.003  # of the output, root mean square, at least
 BEYOND_CHANCE = 1e-6  # probability by chance, at most
 
 _MAX_SAMPLES = 4_096  # in which a lack is looked for
-
-# Times what half of the errors stay within, from which one is a spike: 8 standard
-# deviations of Gaussian noise.
-_SPIKE = 12.0
-
-# Spikes are told that make much of the errors and are few: others may be what the noise
-# is.
-_MUCH_OF_SPIKES = 0.25  # of the squared errors, at least
-_FEW = 0.05  # of the samples, at most
-
-# Spikes follow the inputs of which most come soon after a move, though few samples do.
-_SOON = 4  # samples after a move
-_SELDOM = 0.3  # of all samples are soon after one, at most
-_MOSTLY = 0.7  # of the spikes are, at least
 
 # Lags by which it is seen at little cost that errors are no larger than need be.
 _N_SCREEN = 10
@@ -149,18 +140,6 @@ class CrossCorrelations(NamedTuple):
     lags: NDArray[np.intp]  # -n_lags, ..., n_lags; positive for past inputs
     values: Array  # (n_values, n_outputs, n_inputs): sum_t w[t] v[t - lag] over RMS
     deviation: float  # of independent errors and inputs, at any lag
-
-
-class ResidualTest(NamedTuple):
-    """Statistic, about chi-squared by its degrees of freedom where all is well.
-
-    For an F test it is ``dof * F``. The p-value is 1 where there is nothing to test:
-    no regressor that is independent of the rest, or errors that are zero.
-    """
-
-    statistic: float
-    dof: int
-    p_value: float
 
 
 class InputTests(NamedTuple):
@@ -482,7 +461,7 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
 
     def much(variance: Array) -> NDArray[np.bool_]:
         lacking = variance - innovations
-        return (lacking > _MUCH * variance) & (lacking > _MUCH_OF_OUTPUT**2 * size)
+        return (lacking > _MUCH * variance) & (lacking > MUCH_OF_OUTPUT**2 * size)
 
     if not much(variances).any():
         return False
@@ -525,66 +504,6 @@ def explained_by_inputs(
     )
 
 
-class Spikes(NamedTuple):
-    """Errors of one output that stand out of the others."""
-
-    output: int
-    experiment: int  # of the highest of them
-    sample: int  # in that experiment
-    n_found: int
-    share: float  # of the squared errors of the output
-    follow: bool  # most of them moves of the inputs, which move seldom
-
-
-def find_spikes(evidence: Evidence) -> Spikes | None:
-    """Errors of single samples that make much of those of an output, if any do.
-
-    They stand out of the line between their neighbours, near which coloured noise and
-    what a model lacks stay.
-    """
-    whole = evidence.one_step
-    if len(whole.model.initial_states) != len(whole.records):
-        return None  # of samples that are not kept
-    errors = simulation_errors(whole.model, whole.records)
-    if not all(np.isfinite(e).all() for e in errors):
-        return None
-    bends = [np.zeros_like(e) for e in errors]  # none at the ends of experiments
-    looked_at = [record.known.copy() for record in whole.records]
-    for bend, e, known in zip(bends, errors, looked_at, strict=True):
-        bend[1:-1] = np.abs(e[1:-1] - 0.5 * (e[:-2] + e[2:]))
-        known[1:-1] &= known[:-2] & known[2:]
-    size, ends = np.vstack(bends), np.cumsum([len(e) for e in errors])
-    known = np.vstack(looked_at)
-    if not known.any(axis=0).all():
-        return None
-    middle = [np.median(column[at]) for column, at in zip(size.T, known.T, strict=True)]
-    peaks = (size >= np.roll(size, 1, axis=0)) & (size >= np.roll(size, -1, axis=0))
-    size *= known & peaks & (size > _SPIKE * np.array(middle))
-    count, taken = np.sum(size > 0.0, axis=0), np.sum(size**2, axis=0)
-    total = sum((e**2).sum(axis=0) for e in errors)
-    power = sum((record.y**2).sum(axis=1) for record in whole.records)
-    share = taken / np.where(total > _MUCH_OF_OUTPUT**4 * power, total, np.inf)
-    share[count > _FEW * len(size)] = 0.0
-    output = int(np.argmax(share))
-    if not share[output] > _MUCH_OF_SPIKES:
-        return None
-    at = int(np.argmax(size[:, output]))
-    k = int(np.searchsorted(ends, at, side="right"))
-    sample = at - (int(ends[k - 1]) if k else 0)
-    most = min(float(share[output]), 1.0)
-    after = np.concatenate([_after_moves(record.u) for record in evidence.records])
-    follow = after.mean() < _SELDOM and after[size[:, output] > 0.0].mean() > _MOSTLY
-    return Spikes(output, k, sample, int(count[output]), most, bool(follow))
-
-
-def _after_moves(u: Array) -> NDArray[np.bool_]:
-    """Which samples come soon after inputs (n_inputs, n_samples) move."""
-    after = np.zeros(u.shape[1], dtype=bool)
-    for k in moves_of(u.T) + 1:
-        after[k : k + _SOON] = True
-    return after
-
-
 def _predicted_variances(errors: Sequence[Array]) -> Array:
     """Variances of the errors of every output, given some of its last ones."""
     r = autocorrelations(errors, _N_SCREEN)
@@ -614,21 +533,6 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     ]
 
 
-def through_modes(poles: NDArray[np.complex128], u: Array, times: int = 1) -> Array:
-    """Answers of modes to signals, that go through every pole so many times."""
-    poles = np.asarray(poles, dtype=complex)
-    outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
-    poles = np.where(outside, 1.0 / np.where(outside, poles, 1.0).conj(), poles)
-    spanned, signals = [np.zeros((len(u), 0))], u
-    for pole in np.tile(poles[poles.imag >= 0.0], times):
-        late = signals.astype(complex)
-        answer = scipy.signal.lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
-        spanned += [answer.real, answer.imag] if pole.imag else [answer.real]
-        denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
-        signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
-    return np.hstack(spanned)
-
-
 def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
     """Upper triangular factor of the windows of all experiments.
 
@@ -645,61 +549,3 @@ def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
 
     gram = np.asarray(sum(piece @ piece.T for piece in pieces()))
     return factor_of_pieces(gram, pieces()).T
-
-
-def whitening_filters(errors: Sequence[Array]) -> list[Array]:
-    """Coefficients ``[1, a_1, ..., a_p]`` that whiten the errors of every output."""
-    return [
-        whitening_filter(autoregression([e[:, [i]] for e in errors]))
-        for i in range(errors[0].shape[1])
-    ]
-
-
-def filtered(signals: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
-    """Signals through a filter of every column, but for the first samples of all."""
-    start = max(map(len, filters)) - 1
-    return [
-        np.column_stack(
-            [
-                through_filter(a, x, start)
-                for a, x in zip(filters, signal.T, strict=True)
-            ]
-        )
-        for signal in signals
-    ]
-
-
-def f_test(added: Array, target: Array, dof: int) -> ResidualTest:
-    """What added columns explain of a target of so many degrees of freedom."""
-    left, q = without(added, target)
-    error = dof - q
-    if q == 0 or error < 1 or not target.any():
-        return ResidualTest(0.0, q, 1.0)
-    loss = max(float(left @ left), np.finfo(float).tiny)
-    explained = float(np.sum((target - left) ** 2))
-    statistic = explained / loss * error
-    return ResidualTest(statistic, q, float(special.fdtrc(q, error, statistic / q)))
-
-
-def of_size_one(columns: Array) -> Array:
-    size = np.linalg.norm(columns, axis=0)
-    return columns / np.where(size > 0.0, size, 1.0)
-
-
-def without(known: Array, columns: Array) -> tuple[Array, int]:
-    """What known ones, of size one, do not explain, and of how many directions."""
-    Q = _basis(known)
-    left = columns - Q @ (Q.T @ columns)
-    return left - Q @ (Q.T @ left), Q.shape[1]  # once more: it may be small
-
-
-def _basis(columns: Array) -> Array:
-    """Basis of the directions in which columns of size one are not small.
-
-    Orthonormal up to rounding by the square of what is small. By singular values: which
-    columns a pivoted factorisation leaves out turns on rounding where some are
-    combinations of others, and so would what it spans.
-    """
-    squares, V = np.linalg.eigh(columns.T @ columns)
-    large = squares > DEPENDENT**2
-    return columns @ (V[:, large] / np.sqrt(squares[large]))

@@ -21,7 +21,7 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..evidence.residuals import of_size_one, through_modes, without
+from ..evidence.regressions import of_size_one, through_modes, without
 from ..samples.records import Record
 from ..simulation_error.simulation_fit import (
     Realization,
