@@ -353,9 +353,14 @@ def _foreseeing(
     seen = each[0] < _FORESEEN * errors.shape[1]
     worse = np.sum(each[:, seen] > _FORESEEN * errors.shape[1], axis=1)
     shares[worse > _FEW * np.count_nonzero(seen)] = np.inf
-    for k, curve in enumerate(curves):  # logarithms that are nearly straight tell none
-        if curve.scale == "log" and k > 1 and shares[k] >= _SMOOTHER * shares[k - 2]:
-            shares[k] = np.inf
+    # logarithms that are nearly straight tell none; and by those that do, both curves
+    # foresee more: the smooth one alone meets a few points by chance
+    own = shares.copy()
+    for k, curve in enumerate(curves):
+        if curve.scale == "log" and k > 1:
+            chance = curve.kind == "cubic" and own[k - 1] >= own[k - 3]
+            if chance or own[k] >= _SMOOTHER * own[k - 2]:
+                shares[k] = np.inf
     best = int(np.argmin(shares))
     return best if shares[best] < enough else 0
 

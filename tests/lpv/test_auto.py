@@ -91,6 +91,16 @@ def test_powers_of_a_positive_variable_are_followed_over_its_logarithm(power):
     assert np.abs(errors).max() < 0.15 * np.abs(kept).max()
 
 
+def test_a_smooth_curve_over_logarithms_that_meets_points_by_chance_is_not_taken():
+    """An elbow's angle: over its logarithm the curve that keeps the shape is worse."""
+    angle = np.array([0.2, 0.9, 1.5, 2.2, 2.9])[:, None]
+    c = np.cos(angle[:, 0])
+    M = np.array([[3.0 + 1.2 * c, 0.6 + 0.6 * c], [0.6 + 0.6 * c, 0.6 + 0.0 * c]])
+    inverse = np.linalg.inv(M.transpose(2, 0, 1)).reshape(5, 4)
+    theta = np.hstack([-inverse * [2.0, 1.0, 2.0, 1.0], inverse[:, [0, 1, 3]]])
+    assert AutoLPV().fit(angle, theta).form_ == "pchip"
+
+
 def test_what_is_smooth_over_any_variable_is_followed_by_a_cubic_spline():
     kappa = np.linspace(-1.0, 1.0, 7)[:, None]
     theta = np.column_stack([kappa**2, np.exp(kappa)])
