@@ -48,7 +48,7 @@ _SECTIONS = {
     "Restructuring": ("restructuring", "minimax"),
     "LPV models and interpolation": ("lpv",),
     "The pipeline": ("pipeline",),
-    "Files": ("pipeline/files.py", "pipeline/schema.py", "pipeline/memory.py"),
+    "Files": ("pipeline/model_files", "pipeline/running/memory.py"),
     "State-space models": ("models", "systems"),
     "Scores and reports": ("metrics",),
     "Pictures": ("inspection",),

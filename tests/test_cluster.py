@@ -14,7 +14,7 @@ from sklearn.model_selection import GridSearchCV
 
 from lpvlearn import ExperimentSplit, PolynomialLPV, SubspaceLTI
 from lpvlearn.paper import run_paper_experiment
-from lpvlearn.pipeline.workers import results_of
+from lpvlearn.pipeline.running.workers import results_of
 
 from .conftest import spring_pipeline, spring_tables
 

@@ -19,7 +19,7 @@ import pytest
 from joblib import delayed
 
 from lpvlearn.__main__ import main
-from lpvlearn.pipeline.workers import results_of
+from lpvlearn.pipeline.running.workers import results_of
 
 pytestmark = [
     pytest.mark.slow,

@@ -24,7 +24,16 @@ FLOORS = (
     ("__main__",),
 )
 
-# The same within the largest room.
+# The same within the two largest rooms.
+FLOORS_OF_PIPELINE = (
+    ("checks", "running", "steps"),
+    ("points", "scheduled"),
+    ("one_basis",),
+    ("output_error", "reports"),
+    ("estimator",),
+    ("model_files", "suggestion"),
+    ("__init__",),
+)
 FLOORS_OF_SUBSPACE = (
     ("samples", "telling"),
     ("simulation_error",),
@@ -47,13 +56,18 @@ SPEAKS_SKLEARN = (
     "lpv/interpolator.py",
     "metrics/*",
     "pipeline/*",
+    "pipeline/*/*",
     "inspection/parameters.py",
     "datasets/*",
     "paper/*",
 )
 
 FILES = sorted(ROOT.rglob("*.py"))
-HOUSES = ((ROOT, FLOORS), (ROOT / "subspace", FLOORS_OF_SUBSPACE))
+HOUSES = (
+    (ROOT, FLOORS),
+    (ROOT / "pipeline", FLOORS_OF_PIPELINE),
+    (ROOT / "subspace", FLOORS_OF_SUBSPACE),
+)
 
 
 def files_of(house: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..pipeline.memory import unwritten
+from ..pipeline.running.memory import unwritten
 
 _PROBE = 2**16  # bytes that must find room before the work begins
 

@@ -26,11 +26,11 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
-from ..pipeline.black_boxes import balanced_entries
 from ..pipeline.estimator import Stopwatch
-from ..pipeline.local_models import experiments_of, identify_point
-from ..pipeline.runner import PointRunner
-from ..pipeline.workers import started
+from ..pipeline.one_basis.black_boxes import balanced_entries
+from ..pipeline.points.local_models import experiments_of, identify_point
+from ..pipeline.running.runner import PointRunner
+from ..pipeline.running.workers import started
 from .tables import (
     ParameterSet,
     interpolation_table,

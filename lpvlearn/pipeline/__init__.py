@@ -1,7 +1,7 @@
 """The whole method on one table: the steps in order, over all operating points."""
 
 from .estimator import LocalLPVPipeline
-from .files import load, save
+from .model_files.files import load, save
 from .output_error import OutputErrorLPV
 from .suggestion import suggest_operating_point
 

@@ -57,28 +57,9 @@ from ..validation import (
     units_by_name,
     verbosity,
 )
-from .black_boxes import channel_sizes, foreseen_order
-from .common_choices import common_delay, identify_points
-from .held_scheduling import identified_as_held, tell_of_held
-from .html_report import html_report
-from .left_out import tell_of_two_points, tell_unforeseen
-from .local_models import LocalModel, estimates_outputs, is_left, tell_of_integrators
-from .memory import checked_memory
-from .mislabelled import tell_of_mislabelled
-from .output_error import (
-    best_along,
-    known_coefficients,
-    local_covariance,
-    local_output_errors,
-    refine_model,
-    tell_of_missed,
-)
-from .reports import Summary, Tables, summarise, tables
-from .runner import PointRunner
-from .scheduled import ScheduledEstimator
-from .stability import growth_rates
-from .steps import STEPS, WITHOUT, check_step
-from .structured_models import (
+from .checks.stability import growth_rates
+from .one_basis.black_boxes import foreseen_order
+from .one_basis.structured_models import (
     StructuredModels,
     begins_held,
     mirror_images,
@@ -89,8 +70,33 @@ from .structured_models import (
     with_foreseen,
     without_structure,
 )
-from .together import through_black_boxes
-from .workers import check_jobs
+from .one_basis.together import through_black_boxes
+from .output_error import (
+    best_along,
+    known_coefficients,
+    local_covariance,
+    local_output_errors,
+    refine_model,
+    tell_of_missed,
+)
+from .points.common_choices import common_delay, identify_points
+from .points.held_scheduling import identified_as_held, tell_of_held
+from .points.left_out import tell_of_two_points, tell_unforeseen
+from .points.local_models import (
+    LocalModel,
+    channel_sizes,
+    estimates_outputs,
+    is_left,
+    tell_of_integrators,
+)
+from .points.mislabelled import tell_of_mislabelled
+from .reports.html_report import html_report
+from .reports.tables import Summary, Tables, summarise, tables
+from .running.memory import checked_memory
+from .running.runner import PointRunner
+from .running.workers import check_jobs
+from .scheduled import ScheduledEstimator
+from .steps import STEPS, WITHOUT, check_step
 
 Array = NDArray[np.float64]
 

@@ -58,23 +58,23 @@ from ..validation import (
     verbosity,
     whole_number,
 )
-from .bands import output_errors
-from .black_boxes import balanced_entries
-from .common_choices import common_delay, identify_points, of_structure
-from .error_warnings import CONSTANT, tell_of_errors, tell_of_noisy_scheduling
-from .local_models import LocalModel, balanced_by_motion, identify_point, is_left
-from .runner import PointRunner
-from .scheduled import ScheduledEstimator
-from .stability import grows, growth_rates
-from .steps import check_step
-from .structured_models import (
+from .checks.bands import output_errors
+from .checks.error_warnings import CONSTANT, tell_of_errors, tell_of_noisy_scheduling
+from .checks.stability import grows, growth_rates
+from .one_basis.black_boxes import balanced_entries
+from .one_basis.structured_models import (
     StructuredModels,
     mirror_images,
     over_points,
     restructure_points,
     without_structure,
 )
-from .workers import check_jobs, results_of
+from .points.common_choices import common_delay, identify_points, of_structure
+from .points.local_models import LocalModel, balanced_by_motion, identify_point, is_left
+from .running.runner import PointRunner
+from .running.workers import check_jobs, results_of
+from .scheduled import ScheduledEstimator
+from .steps import check_step
 
 Array = NDArray[np.float64]
 

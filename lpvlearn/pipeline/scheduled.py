@@ -19,8 +19,8 @@ from ..lpv.extrapolation import warn_extrapolation
 from ..lpv.model import LPVStateSpace
 from ..metrics.table_simulation import simulate_experiments
 from ..validation import flag
-from .bands import prediction_std
-from .workers import end_what_begins_with_this_process
+from .checks.bands import prediction_std
+from .running.workers import end_what_begins_with_this_process
 
 Array = NDArray[np.float64]
 

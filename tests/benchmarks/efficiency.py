@@ -44,8 +44,8 @@ from lpvlearn import (
     LocalLPVPipeline,
     SubspaceLTI,
 )
-from lpvlearn.pipeline.local_models import _average
-from lpvlearn.pipeline.structured_models import covariance_of_parameters
+from lpvlearn.pipeline.one_basis.structured_models import covariance_of_parameters
+from lpvlearn.pipeline.points.local_models import _average
 from lpvlearn.restructuring.minimise_covariance import efficient_parameters
 
 STRUCTURE = GrayBoxStructure.mechanical(

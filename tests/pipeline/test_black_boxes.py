@@ -20,13 +20,13 @@ from lpvlearn import (
 from lpvlearn.datasets import prbs
 from lpvlearn.exceptions import collected
 from lpvlearn.lpv.alignment import aligned_models
-from lpvlearn.pipeline.black_boxes import (
+from lpvlearn.pipeline.one_basis.black_boxes import (
     _entries,
     _with_fast_states,
     aligned_black_boxes,
     tell_of_forced,
 )
-from lpvlearn.pipeline.local_models import LocalModel
+from lpvlearn.pipeline.points.local_models import LocalModel
 
 from ..conftest import ROLES, modes
 

@@ -16,7 +16,7 @@ from lpvlearn import (
     bft_score,
     from_trajectories,
 )
-from lpvlearn.pipeline.branches import smoothest_family
+from lpvlearn.pipeline.one_basis.branches import smoothest_family
 
 NOISE = 0.01
 

@@ -17,7 +17,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.datasets import prbs
-from lpvlearn.pipeline.canonical import canonical_black_boxes
+from lpvlearn.pipeline.one_basis.canonical import canonical_black_boxes
 
 from ..conftest import ROLES, modes, spring_sweep, spring_tables
 

@@ -9,10 +9,10 @@ from sklearn.base import clone
 
 from lpvlearn import LocalLPVPipeline, StateSpace, SubspaceLTI
 from lpvlearn.exceptions import collected
-from lpvlearn.pipeline import common_choices
-from lpvlearn.pipeline.common_choices import _of_own_orders
-from lpvlearn.pipeline.local_models import LocalModel, identify_point
-from lpvlearn.pipeline.runner import Done
+from lpvlearn.pipeline.points import common_choices
+from lpvlearn.pipeline.points.common_choices import _of_own_orders
+from lpvlearn.pipeline.points.local_models import LocalModel, identify_point
+from lpvlearn.pipeline.running.runner import Done
 
 from ..conftest import ROLES, spring_tables
 

@@ -42,9 +42,9 @@ from lpvlearn import (
 from lpvlearn.datasets import prbs
 from lpvlearn.exceptions import VersionedPickle, VersionWarning, collected
 from lpvlearn.models.innovation import NoiseModel
-from lpvlearn.pipeline.files import _TEXT, SCHEMA
-from lpvlearn.pipeline.memory import fingerprint
-from lpvlearn.pipeline.schema import CLASSES, FORMS, before_saving
+from lpvlearn.pipeline.model_files.files import _TEXT, SCHEMA
+from lpvlearn.pipeline.model_files.schema import CLASSES, FORMS, before_saving
+from lpvlearn.pipeline.running.memory import fingerprint
 
 from ..conftest import (
     ROLES,

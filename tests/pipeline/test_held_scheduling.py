@@ -9,7 +9,7 @@ import pytest
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
 from lpvlearn.data.experiments import read_experiments
 from lpvlearn.data.operating_points import local_experiments
-from lpvlearn.pipeline.held_scheduling import _held, _slope
+from lpvlearn.pipeline.points.held_scheduling import _held, _slope
 
 ROLES = {"scheduling": "charge", "experiment": "run", "time": "t"}
 LEVELS = (0.2, 0.4, 0.6, 0.8)

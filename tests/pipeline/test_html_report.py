@@ -18,7 +18,7 @@ from lpvlearn import (
     load,
     save,
 )
-from lpvlearn.pipeline.html_report import _expression, reproducing_code
+from lpvlearn.pipeline.reports.html_report import _expression, reproducing_code
 
 from ..conftest import ROLES, spring_pipeline, stable_model
 

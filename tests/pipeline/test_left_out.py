@@ -16,7 +16,7 @@ from lpvlearn import (
     SplineLPV,
 )
 from lpvlearn.lpv.left_out import values_left_out
-from lpvlearn.pipeline.left_out import errors_left_out, tell_unforeseen
+from lpvlearn.pipeline.points.left_out import errors_left_out, tell_unforeseen
 
 from ..conftest import spring_pipeline, spring_tables
 

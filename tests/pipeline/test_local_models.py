@@ -16,8 +16,8 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline import local_models
-from lpvlearn.pipeline.local_models import (
+from lpvlearn.pipeline.points import local_models
+from lpvlearn.pipeline.points.local_models import (
     LocalModel,
     identify_point,
     tell_of_integrators,

@@ -14,8 +14,8 @@ import pytest
 from joblib import Memory
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, PolynomialLPV
-from lpvlearn.pipeline.memory import fingerprint
-from lpvlearn.pipeline.runner import PointRunner
+from lpvlearn.pipeline.running.memory import fingerprint
+from lpvlearn.pipeline.running.runner import PointRunner
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 

@@ -5,8 +5,8 @@ import pytest
 
 from lpvlearn import StateSpace
 from lpvlearn.exceptions import collected
-from lpvlearn.pipeline.local_models import LocalModel
-from lpvlearn.pipeline.mislabelled import tell_of_mislabelled
+from lpvlearn.pipeline.points.local_models import LocalModel
+from lpvlearn.pipeline.points.mislabelled import tell_of_mislabelled
 
 KAPPA = np.arange(4.0)[:, None]
 ONES = np.ones(4)

@@ -15,7 +15,7 @@ from lpvlearn import (
     SubspaceLTI,
 )
 from lpvlearn.exceptions import Told, warn
-from lpvlearn.pipeline.runner import Done, PointRunner, tell_skipped
+from lpvlearn.pipeline.running.runner import Done, PointRunner, tell_skipped
 
 from ..conftest import (
     spring_pipeline,

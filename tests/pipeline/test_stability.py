@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn import LPVStateSpace, PolynomialLPV, SplineLPV
-from lpvlearn.pipeline.stability import growth_rates
+from lpvlearn.pipeline.checks.stability import growth_rates
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 

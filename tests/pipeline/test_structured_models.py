@@ -21,13 +21,13 @@ from lpvlearn import (
     make_bft_scorer,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.local_models import LocalModel, identify_point
-from lpvlearn.pipeline.structured_models import (
+from lpvlearn.pipeline.one_basis.structured_models import (
     StructuredModels,
     covariance_of_parameters,
     restructure_points,
     with_foreseen,
 )
+from lpvlearn.pipeline.points.local_models import LocalModel, identify_point
 
 from ..conftest import (
     KAPPA,

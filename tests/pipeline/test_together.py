@@ -8,15 +8,15 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import AutoLPV, GrayBoxStructure, SplineLPV
 from lpvlearn.models.statespace import DEVIATION
-from lpvlearn.pipeline.local_models import LocalModel
-from lpvlearn.pipeline.structured_models import StructuredModels
-from lpvlearn.pipeline.together import (
+from lpvlearn.pipeline.one_basis.structured_models import StructuredModels
+from lpvlearn.pipeline.one_basis.together import (
     _along_the_points,
     _may_have,
     _misfit,
     fitted_together,
     through_black_boxes,
 )
+from lpvlearn.pipeline.points.local_models import LocalModel
 from lpvlearn.restructuring.minimise_covariance import UncertainBoxes
 
 LAGS = GrayBoxStructure.from_template(

@@ -3,7 +3,7 @@
 import pytest
 from joblib import delayed, parallel_config
 
-from lpvlearn.pipeline.workers import check_jobs, results_of
+from lpvlearn.pipeline.running.workers import check_jobs, results_of
 
 
 def test_no_more_jobs_than_tasks_or_processors_are_begun():

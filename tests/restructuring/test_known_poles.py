@@ -7,7 +7,7 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
-from lpvlearn.pipeline.common_choices import of_structure
+from lpvlearn.pipeline.points.common_choices import of_structure
 from lpvlearn.restructuring.error_system import series
 from lpvlearn.restructuring.known_poles import divide, hidden_integrators
 

@@ -16,7 +16,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.models.statespace import DEVIATION
-from lpvlearn.pipeline.local_models import _integrating_outputs
+from lpvlearn.pipeline.points.local_models import _integrating_outputs
 
 STEP = 0.02
 SERVO = GrayBoxStructure.from_template(

@@ -14,9 +14,9 @@ import numpy as np
 from joblib import Memory, delayed
 from numpy.typing import NDArray
 
-from ..exceptions import Told, collected, warn
-from ..systems.threads import one_blas_thread
-from ..validation import number_shown
+from ...exceptions import Told, collected, warn
+from ...systems.threads import one_blas_thread
+from ...validation import number_shown
 from .memory import Remembered
 from .workers import results_of
 

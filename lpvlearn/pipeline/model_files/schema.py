@@ -23,25 +23,25 @@ import numpy as np
 import pandas as pd
 from sklearn.base import BaseEstimator
 
-from ..lpv.auto import AutoLPV
-from ..lpv.interpolator import Interpolator
-from ..lpv.model import LPVStateSpace
-from ..lpv.polynomial import PolynomialLPV
-from ..lpv.rational import RationalLPV
-from ..lpv.spline import SplineLPV
-from ..models.innovation import InnovationModel, NoiseModel
-from ..models.statespace import StateSpace
-from ..restructuring.estimator import GrayBoxRestructurer
-from ..restructuring.identifiability import Identifiability
-from ..structures.map import AffineMap, FixedMap, FunctionMap, RowsMap, StructureMap
-from ..structures.mechanical import FluxMap, ImplicitMap
-from ..structures.structure import GrayBoxStructure
-from ..subspace.estimator import SubspaceLTI
-from ..subspace.evidence.offsets import Offsets
-from ..subspace.evidence.statistics import Evidence, Known
-from ..subspace.fits.integrating import RateEvidence
-from .estimator import LocalLPVPipeline
-from .output_error import OutputErrorLPV
+from ...lpv.auto import AutoLPV
+from ...lpv.interpolator import Interpolator
+from ...lpv.model import LPVStateSpace
+from ...lpv.polynomial import PolynomialLPV
+from ...lpv.rational import RationalLPV
+from ...lpv.spline import SplineLPV
+from ...models.innovation import InnovationModel, NoiseModel
+from ...models.statespace import StateSpace
+from ...restructuring.estimator import GrayBoxRestructurer
+from ...restructuring.identifiability import Identifiability
+from ...structures.map import AffineMap, FixedMap, FunctionMap, RowsMap, StructureMap
+from ...structures.mechanical import FluxMap, ImplicitMap
+from ...structures.structure import GrayBoxStructure
+from ...subspace.estimator import SubspaceLTI
+from ...subspace.evidence.offsets import Offsets
+from ...subspace.evidence.statistics import Evidence, Known
+from ...subspace.fits.integrating import RateEvidence
+from ..estimator import LocalLPVPipeline
+from ..output_error import OutputErrorLPV
 
 # Numbers that a loaded object may be put to, beyond those in the file: the derivatives
 # of a structure that solves equations, the distances of a spline's nodes. 70 MB; 3000

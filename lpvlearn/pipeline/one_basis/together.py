@@ -24,15 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import pinvh
 
-from ..exceptions import warn
-from ..lpv.alignment import spanning_tree
-from ..lpv.auto import AutoLPV
-from ..lpv.polynomial import PolynomialLPV, resolvable_powers
-from ..lpv.weighting import is_chance
-from ..restructuring.deadline import time_is_up
-from ..restructuring.minimise_covariance import UncertainBoxes, common_coefficients
-from ..structures.structure import GrayBoxStructure
-from .stability import holds_within_range
+from ...exceptions import warn
+from ...lpv.alignment import spanning_tree
+from ...lpv.auto import AutoLPV
+from ...lpv.polynomial import PolynomialLPV, resolvable_powers
+from ...lpv.weighting import is_chance
+from ...restructuring.deadline import time_is_up
+from ...restructuring.minimise_covariance import UncertainBoxes, common_coefficients
+from ...structures.structure import GrayBoxStructure
+from ..checks.stability import holds_within_range
 from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]

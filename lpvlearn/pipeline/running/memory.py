@@ -27,10 +27,10 @@ import scipy
 from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
-from ..exceptions import warn
-from ..validation import shown
+from ...exceptions import warn
+from ...validation import shown
 
-_LIBRARY = Path(__file__).parents[1]
+_LIBRARY = Path(__file__).parents[2]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_FOLDER = (errno.ENOENT, errno.ENOTDIR)

@@ -24,17 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from ..lpv.alignment import spanning_tree
-from ..models.scheduling_range import in_range_of_points
-from ..restructuring.problem import RestructuringProblem
-from ..structures.interchanges import (
+from ...lpv.alignment import spanning_tree
+from ...models.scheduling_range import in_range_of_points
+from ...restructuring.problem import RestructuringProblem
+from ...structures.interchanges import (
     distance,
     interchanges,
     known_before,
     slow_first,
     within_bounds,
 )
-from ..structures.structure import GrayBoxStructure
+from ...structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
 Choices = NDArray[np.intp]

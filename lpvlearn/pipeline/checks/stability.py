@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.operating_points import neighbours
-from ..exceptions import warn
-from ..lpv.interpolator import Interpolator
-from ..lpv.model import LPVStateSpace
-from ..models.scheduling_range import grid_over
-from ..structures.structure import GrayBoxStructure
-from ..validation import number_shown
+from ...data.operating_points import neighbours
+from ...exceptions import warn
+from ...lpv.interpolator import Interpolator
+from ...lpv.model import LPVStateSpace
+from ...models.scheduling_range import grid_over
+from ...structures.structure import GrayBoxStructure
+from ...validation import number_shown
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exceptions import warn
-from ..models.scheduling_range import in_range_of_points
+from ...exceptions import warn
+from ...models.scheduling_range import in_range_of_points
+from ..running.runner import place_of
 from .left_out import forgetting, forgotten
 from .local_models import LocalModel
-from .runner import place_of
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -14,20 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import ROLES, Experiment, as_table
-from ..data.preparation import DETRENDS
-from ..exceptions import Told, collected, retold, warn
-from ..lpv.alignment import rotation_to
-from ..models.statespace import (
+from ...data.experiments import ROLES, Experiment, as_table
+from ...data.preparation import DETRENDS
+from ...exceptions import Told, collected, retold, warn
+from ...lpv.alignment import rotation_to
+from ...models.statespace import (
     ModelPair,
     StateSpace,
     balanced_models,
     scaled,
 )
-from ..restructuring.minimise_covariance import Estimate
-from ..subspace.evidence.constants import CERTAIN
-from ..subspace.fits.integrating import integrating_flags
-from ..systems.modes import lasting, n_changes
+from ...restructuring.minimise_covariance import Estimate
+from ...subspace.evidence.constants import CERTAIN
+from ...subspace.fits.integrating import integrating_flags
+from ...systems.modes import lasting, n_changes
 
 Array = NDArray[np.float64]
 
@@ -363,6 +363,13 @@ def motions(
         mean, variance = _moments(values, about_own=True)
         found.append((mean, np.where(variance > 0, np.sqrt(variance), 1.0)))
     return found[0], found[1]
+
+
+def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]:
+    """How far inputs and outputs move at the points, root mean squares of all."""
+    both = zip(*(motions(group) for group in groups), strict=True)
+    u, y = (np.sqrt(np.mean([std**2 for _, std in one], axis=0)) for one in both)
+    return u, y
 
 
 def _moments(values: Sequence[Any], *, about_own: bool) -> tuple[Array, Array]:

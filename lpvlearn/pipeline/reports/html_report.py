@@ -20,21 +20,21 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.tables import Table
-from ..exceptions import collected
-from ..exceptions import version as own_version
-from ..inspection.bode import BodeDisplay
-from ..inspection.drawing import with_unit
-from ..inspection.parameters import ParameterDisplay
-from ..inspection.poles import PoleDisplay
-from ..inspection.residuals import ResidualDisplay
-from ..inspection.simulation import SimulationDisplay
-from ..inspection.uncertainty import UncertaintyDisplay
-from ..metrics.reports import LABEL, as_shown, fit_report, readable_report
-from ..metrics.scorers import InitialState
-from ..models.statespace import StateSpace
-from ..structures.structure import GrayBoxStructure
-from .reports import Summary
+from ...data.tables import Table
+from ...exceptions import collected
+from ...exceptions import version as own_version
+from ...inspection.bode import BodeDisplay
+from ...inspection.drawing import with_unit
+from ...inspection.parameters import ParameterDisplay
+from ...inspection.poles import PoleDisplay
+from ...inspection.residuals import ResidualDisplay
+from ...inspection.simulation import SimulationDisplay
+from ...inspection.uncertainty import UncertaintyDisplay
+from ...metrics.reports import LABEL, as_shown, fit_report, readable_report
+from ...metrics.scorers import InitialState
+from ...models.statespace import StateSpace
+from ...structures.structure import GrayBoxStructure
+from .tables import Summary
 
 _WIDTH = 4.4  # inches of a figure: the width of a telephone
 _HEIGHT, _ROW = 2.9, 2.1  # inches of a single panel, of one among several rows

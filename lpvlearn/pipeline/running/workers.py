@@ -19,8 +19,8 @@ from joblib import Parallel, cpu_count, delayed, effective_n_jobs
 from joblib.externals.loky import reusable_executor
 from joblib.parallel import get_active_backend
 
-from ..systems.worker import WATCH, end_with_parent
-from ..validation import shown
+from ...systems.worker import WATCH, end_with_parent
+from ...validation import shown
 
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]

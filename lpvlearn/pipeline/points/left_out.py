@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.operating_points import neighbours
-from ..exceptions import warn
-from ..lpv.left_out import values_left_out
-from ..lpv.model import LPVStateSpace
-from ..lpv.spline import SplineLPV
-from ..models.statespace import StateSpace
-from ..restructuring.error_system import frequency_grid
-from ..structures.structure import GrayBoxStructure
-from ..validation import listed
-from .runner import label_of
+from ...data.operating_points import neighbours
+from ...exceptions import warn
+from ...lpv.left_out import values_left_out
+from ...lpv.model import LPVStateSpace
+from ...lpv.spline import SplineLPV
+from ...models.statespace import StateSpace
+from ...restructuring.error_system import frequency_grid
+from ...structures.structure import GrayBoxStructure
+from ...validation import listed
+from ..running.runner import label_of
 
 Array = NDArray[np.float64]
 

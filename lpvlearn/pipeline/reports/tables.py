@@ -9,26 +9,26 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.experiments import Experiment
-from ..exceptions import warn
-from ..lpv.model import LPVStateSpace
-from ..lpv.spline import SplineLPV
-from ..lpv.weighting import noise_explains
-from ..metrics.reports import LABEL, as_shown, readable_report
-from ..metrics.scores import best_fit, parameter_fit
-from ..models.statespace import StateSpace, unknown_responses
-from ..restructuring.estimator import GrayBoxRestructurer
-from ..systems.simulation import (
+from ...data.experiments import Experiment
+from ...exceptions import warn
+from ...lpv.model import LPVStateSpace
+from ...lpv.spline import SplineLPV
+from ...lpv.weighting import noise_explains
+from ...metrics.reports import LABEL, as_shown, readable_report
+from ...metrics.scores import best_fit, parameter_fit
+from ...models.statespace import StateSpace, unknown_responses
+from ...restructuring.estimator import GrayBoxRestructurer
+from ...systems.simulation import (
     delayed,
     estimate_initial_state,
     spread_of,
     state_trajectory,
     trend_signals,
 )
-from ..validation import number_shown
-from .left_out import listed_errors
-from .local_models import LocalModel, motions
-from .structured_models import StructuredModels
+from ...validation import number_shown
+from ..one_basis.structured_models import StructuredModels
+from ..points.left_out import listed_errors
+from ..points.local_models import LocalModel, motions
 
 Array = NDArray[np.float64]
 

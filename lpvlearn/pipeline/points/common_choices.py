@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import Experiment
-from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, warn
-from ..restructuring.known_poles import hidden_integrators, integrators
-from ..structures.structure import GrayBoxStructure
-from ..subspace.estimator import SubspaceLTI
-from ..subspace.fits.delay import with_late_inputs
-from ..subspace.simulation_error.criterion import PRICE
+from ...data.experiments import Experiment
+from ...data.operating_points import OperatingPoints
+from ...exceptions import collected, warn
+from ...restructuring.known_poles import hidden_integrators, integrators
+from ...structures.structure import GrayBoxStructure
+from ...subspace.estimator import SubspaceLTI
+from ...subspace.fits.delay import with_late_inputs
+from ...subspace.simulation_error.criterion import PRICE
+from ..running.runner import Done, PointRunner, label_of, tell_skipped
 from .local_models import (
     LocalModel,
     identify_point,
@@ -31,7 +32,6 @@ from .local_models import (
     is_left,
     labels_of,
 )
-from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
 

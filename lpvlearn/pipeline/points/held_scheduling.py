@@ -30,15 +30,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import Experiment
-from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, repeat, warn
-from ..lpv.equilibria import STANDING
-from ..lpv.spline import SplineLPV
-from ..subspace.evidence.constants import CERTAIN
-from .black_boxes import channel_sizes
-from .local_models import LocalModel, is_left, motions
-from .runner import PointRunner
+from ...data.experiments import Experiment
+from ...data.operating_points import OperatingPoints
+from ...exceptions import collected, repeat, warn
+from ...lpv.equilibria import STANDING
+from ...lpv.spline import SplineLPV
+from ...subspace.evidence.constants import CERTAIN
+from ..running.runner import PointRunner
+from .local_models import LocalModel, channel_sizes, is_left, motions
 
 Array = NDArray[np.float64]
 

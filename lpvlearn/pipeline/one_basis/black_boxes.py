@@ -14,20 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..data.experiments import Experiment
-from ..exceptions import warn
-from ..lpv.alignment import (
+from ...exceptions import warn
+from ...lpv.alignment import (
     OUTPUTS,
     STATES,
     aligned_models,
     show_all_states,
     spanning_tree,
 )
-from ..lpv.spline import SplineLPV
-from ..models.statespace import StateSpace, scaled, with_signs_of
-from ..structures.structure import GrayBoxStructure
-from ..validation import listed
-from .left_out import (
+from ...lpv.spline import SplineLPV
+from ...models.statespace import StateSpace, scaled, with_signs_of
+from ...structures.structure import GrayBoxStructure
+from ...validation import listed
+from ..points.left_out import (
     NEAR,
     UNLIKE,
     changed,
@@ -36,8 +35,8 @@ from .left_out import (
     forgotten,
     largest_difference,
 )
-from .local_models import LocalModel, motions
-from .runner import place_of
+from ..points.local_models import LocalModel
+from ..running.runner import place_of
 
 Array = NDArray[np.float64]
 
@@ -184,13 +183,6 @@ def foreseen_order(
         f"local=SubspaceLTI(order={order})."
     )
     return best
-
-
-def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]:
-    """How far inputs and outputs move at the points, root mean squares of all."""
-    both = zip(*(motions(group) for group in groups), strict=True)
-    u, y = (np.sqrt(np.mean([std**2 for _, std in one], axis=0)) for one in both)
-    return u, y
 
 
 def balanced_entries(

@@ -16,39 +16,38 @@ from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, retold, take_back, warn
-from ..lpv.auto import AutoLPV
-from ..lpv.equilibria import points_of_work
-from ..lpv.left_out import interpolated_without, takes_covariance, values_left_out
-from ..lpv.model import LPVStateSpace
-from ..models.scheduling_range import in_range_of_points
-from ..models.statespace import DEVIATION, ModelPair, StateSpace
-from ..restructuring.deadline import bounded, time_is_up
-from ..restructuring.minimise_covariance import Estimate
-from ..restructuring.problem import GOOD_FIT, problem_from_models
-from ..restructuring.uncertainty import ParameterUncertainty
-from ..structures.interchanges import (
+from ...data.operating_points import OperatingPoints
+from ...exceptions import collected, retold, take_back, warn
+from ...lpv.auto import AutoLPV
+from ...lpv.equilibria import points_of_work
+from ...lpv.left_out import interpolated_without, takes_covariance, values_left_out
+from ...lpv.model import LPVStateSpace
+from ...models.scheduling_range import in_range_of_points
+from ...models.statespace import DEVIATION, ModelPair, StateSpace
+from ...restructuring.deadline import bounded, time_is_up
+from ...restructuring.minimise_covariance import Estimate
+from ...restructuring.problem import GOOD_FIT, problem_from_models
+from ...restructuring.uncertainty import ParameterUncertainty
+from ...structures.interchanges import (
     INTERCHANGE,
     as_plausible,
     interchanges,
     known_before,
     told_by_motion,
 )
-from ..structures.structure import GrayBoxStructure
-from ..systems.beginnings import Beginning, begin_held, waiting
+from ...structures.structure import GrayBoxStructure
+from ...systems.beginnings import Beginning, begin_held, waiting
+from ..points.left_out import NEAR, largest_difference
+from ..points.local_models import LocalModel, channel_sizes, motions
+from ..running.runner import Done, PointRunner, place_of, tell_skipped
 from .black_boxes import (
     aligned_black_boxes,
     balanced,
     balanced_entries,
-    channel_sizes,
     tell_of_forced,
 )
 from .branches import Doubt, tied_branches
 from .canonical import canonical_black_boxes, is_better_form
-from .left_out import NEAR, largest_difference
-from .local_models import LocalModel, motions
-from .runner import Done, PointRunner, place_of, tell_skipped
 
 Array = NDArray[np.float64]
 

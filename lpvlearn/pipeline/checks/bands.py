@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.containers import row_labels
-from ..data.experiments import Experiment, naming
-from ..data.tables import n_rows_of
-from ..lpv.bands import levels_of, simulation_std
-from ..lpv.model import LPVStateSpace
+from ...data.containers import row_labels
+from ...data.experiments import Experiment, naming
+from ...data.tables import n_rows_of
+from ...lpv.bands import levels_of, simulation_std
+from ...lpv.model import LPVStateSpace
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exceptions import warn
-from ..lpv.model import LPVStateSpace
-from ..lpv.refinement import Own, Prior, Record, refine, squares, weights_of
-from ..subspace.evidence.residuals import explained_by_inputs
+from ...exceptions import warn
+from ...lpv.model import LPVStateSpace
+from ...lpv.refinement import Own, Prior, Record, refine, squares, weights_of
+from ...subspace.evidence.residuals import explained_by_inputs
 
 Array = NDArray[np.float64]
 

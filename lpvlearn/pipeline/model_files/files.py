@@ -1,9 +1,9 @@
 """Models in files without code: a zip of one JSON text and the arrays it names.
 
 `save` writes what a model is, `load` builds it anew: classes by a closed list of names,
-every field of the form that :mod:`~lpvlearn.pipeline.schema` gives it. Nothing in a
-file is ever run. Members are stored, not compressed, and an array belongs to one field
-only, so that a file takes a few times its size in memory at most.
+every field of the form that `schema` gives it. Nothing in a file is ever run. Members
+are stored, not compressed, and an array belongs to one field only, so that a file takes
+a few times its size in memory at most.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..exceptions import PLAIN_DTYPES, version
-from ..systems.whole_files import whole_file
-from ..validation import file_name, shown
-from .memory import unwritten
+from ...exceptions import PLAIN_DTYPES, version
+from ...systems.whole_files import whole_file
+from ...validation import file_name, shown
+from ..running.memory import unwritten
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
 
 SCHEMA = 1  # raised when a file of today could be misread by the code of tomorrow

@@ -16,27 +16,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lpv.auto import AutoLPV
-from ..lpv.extrapolation import distance_from_hull
-from ..lpv.polynomial import PolynomialLPV
-from ..lpv.rational import RationalLPV
-from ..lpv.spline import SplineLPV
-from ..lpv.weighting import noise_explains
-from ..models.statespace import DEVIATION, StateSpace, scaled
-from ..restructuring.coordinates import CanonicalForm
-from ..structures.structure import GrayBoxStructure
-from ..structures.templates import generic_indices
-from ..systems.least_squares import RCOND, column_scale
-from .black_boxes import of_rates
-from .left_out import (
+from ...lpv.auto import AutoLPV
+from ...lpv.extrapolation import distance_from_hull
+from ...lpv.polynomial import PolynomialLPV
+from ...lpv.rational import RationalLPV
+from ...lpv.spline import SplineLPV
+from ...lpv.weighting import noise_explains
+from ...models.statespace import DEVIATION, StateSpace, scaled
+from ...restructuring.coordinates import CanonicalForm
+from ...structures.structure import GrayBoxStructure
+from ...structures.templates import generic_indices
+from ...systems.least_squares import RCOND, column_scale
+from ..checks.stability import holds_within_range
+from ..points.left_out import (
     UNLIKE,
     errors_left_out,
     forgetting,
     forgotten,
     largest_difference,
 )
-from .local_models import LocalModel
-from .stability import holds_within_range
+from ..points.local_models import LocalModel
+from .black_boxes import of_rates
 
 Array = NDArray[np.float64]
 

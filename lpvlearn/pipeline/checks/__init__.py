@@ -1,0 +1,1 @@
+"""What an LPV model is asked once it is there: stability, errors, bands."""

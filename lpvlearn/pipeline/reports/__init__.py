@@ -1,0 +1,1 @@
+"""What a pipeline found, as tables and as an HTML page."""
