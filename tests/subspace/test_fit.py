@@ -500,6 +500,15 @@ def test_an_output_at_rest_is_at_no_limit():
     SubspaceLTI().fit(u, y)
 
 
+def test_a_coarse_sensor_whose_model_moves_within_a_step_is_at_no_limit():
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.standard_normal((60, 1)), 10, axis=0)
+    u[300:400] = 2.5 + 0.1 * u[300:400]
+    y = 0.4 * np.round(lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0) / 0.4)
+    assert len(stays_put([y[:, 0]])[0]) == 1
+    SubspaceLTI().fit(u, y)  # silently
+
+
 def test_a_decay_that_is_not_known_is_told():
     n_told = 0
     for seed in range(2):

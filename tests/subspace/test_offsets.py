@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
+from lpvlearn.subspace.alternatives import trends
 from lpvlearn.subspace.evidence import constants
 from lpvlearn.subspace.evidence.constants import (
     _tail,
@@ -144,6 +145,18 @@ def test_a_given_order_does_not_hide_a_drift(rng, size):
 
 
 @pytest.mark.filterwarnings("ignore:Output . drifts along a line")
+def test_what_constants_gain_beside_a_given_order_is_no_drift(rng, monkeypatch):
+    """Where constants were not suspected, and drifts are."""
+    u = np.repeat(rng.standard_normal((40, 1)), 10, axis=0)
+    y = 2.0 + lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0)
+    y += 0.02 * rng.standard_normal(y.shape)
+    monkeypatch.setattr(trends, "may_have_constants", lambda *_, **__: False)
+    monkeypatch.setattr(trends, "_drifts_off", lambda *_: True)
+    model = SubspaceLTI(1).fit(u, y)
+    assert model.offset_ == "constant"
+    assert not model.output_drift_.any()
+
+
 @pytest.mark.parametrize("order", ["auto", 3])
 def test_a_drift_is_no_integrator_that_the_level_of_an_input_moves(rng, order):
     X, y = table(rng, levels=(5.0,), n=600, noise=0.1, drift=3.0, u0=4.0)

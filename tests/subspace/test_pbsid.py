@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from scipy import linalg
-from scipy.signal import lfilter
+from scipy.signal import decimate, lfilter
 from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
@@ -921,3 +921,21 @@ def test_constants_beside_a_given_order_are_no_less_likely_than_none(speed, seed
         model = SubspaceLTI(2, method="pbsid").fit(u, y)
     assert model.offset_ == "constant"
     assert model.score(u, y) > 0.99
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_filters_that_know_later_samples_make_no_plant_that_alternates(seed):
+    """Zero-phase decimation: inputs know the errors, and nobody controls."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([1.0], [1.0, -0.98], rng.standard_normal((16_000, 1)), axis=0)
+    y = lfilter([0.0, 0.01], [1.0, -1.98, 0.985], u, axis=0)
+    y += lfilter([0.003], [1.0, -0.997], u, axis=0)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    u, y = (decimate(x, 20, ftype="fir", axis=0) for x in (u, y))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI().fit(u[:400], y[:400])
+    assert any("filters that know later samples" in str(w.message) for w in caught)
+    assert model.lti_.is_stable
+    fresh = model.predict_with_initial_state(u[400:], y[400:])
+    assert bft_score(y[400:], fresh) > 97.0

@@ -55,6 +55,7 @@ class Doubt(NamedTuple):
     bft: float  # on parts held out, percent
     bft_taken: float  # of the model that was taken instead
     grew: bool  # whether it was unstable
+    alternated: bool  # and no sampled plant
 
 
 def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | None]:
@@ -124,6 +125,9 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
             better = of_that.clearly_better_than(error, DOUBT)
+        if _alternates(best) and not open_loop.grows():
+            # as filters make them that know later samples, and no plant
+            blind, of_blind, better = open_loop, of_that, True
         if better:
             best, error = blind, of_blind
         if answered and not shown and as_said is True:
@@ -135,12 +139,21 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         pass
     if best is first:
         return first, None
-    doubt = Doubt(before.bft, error.bft, first.grows())
+    doubt = Doubt(before.bft, error.bft, first.grows(), _alternates(first))
     if n_trend and choices.offset == "auto":  # constants are judged anew
         free = as_said if best.evidence.free.direct.any() else False
         same = samples.having(method=best.method, feedthrough=free)
         best = with_trends(same, best)
     return best, doubt
+
+
+def _alternates(fitted: LocalFit) -> bool:
+    """Whether a mode grows from sample to sample with another sign.
+
+    No sampled plant has a real pole below -1: those of continuous time have no sign.
+    """
+    poles = np.linalg.eigvals(fitted.model.A)
+    return bool((poles[poles.imag == 0.0].real < -1.0).any())
 
 
 def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:

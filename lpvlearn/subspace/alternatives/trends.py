@@ -138,6 +138,11 @@ def _with_drifts(samples: Samples, fitted: LocalFit, refused: float) -> LocalFit
         return fitted
     if other.offsets.drifts.any() and _takes_a_gain(fitted.evidence, other.evidence):
         return fitted
+    if given and not fitted.evidence.free.n_trend:
+        # What constants gain is no drift.
+        level = samples.tried(1, fitted)
+        if level is not None and not level.worse_than(other) > asked:
+            return level
     order = len(other.model.A)
     if order > len(fitted.model.A) and not given:
         # What more states gain is no drift.

@@ -16,6 +16,7 @@ from ...data.faulty_signals import (
     wraps,
 )
 from ...data.preparation import Pairs, constant_columns
+from ..evidence.rounding import Rounding
 from ..fits.local_fit import LocalFit
 from ..telling import Telling, in_experiment
 
@@ -141,6 +142,9 @@ def tell_of_limits(
     with np.errstate(over="ignore", invalid="ignore"):
         moves = [model.outputs(record, k) for k, record in enumerate(records)]
         least = _MOVES_ON * np.std(np.vstack(moves), axis=0)
+    # within a step of a rounded output it need not move
+    steps = np.sqrt(12.0 * Rounding.of(records).variances)
+    least = np.maximum(least, steps)
     for i in np.flatnonzero(np.isfinite(least)):
         passed = [
             (y[start, i], stop - start)

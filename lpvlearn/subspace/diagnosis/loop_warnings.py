@@ -33,6 +33,12 @@ def tell_of_feedback(
             "Or samples are means (as of pandas' resample().mean()) over times within "
             "which inputs move, which the next ones tell: keep single samples then. "
         )
+    if doubt is not None and doubt.alternated:
+        what += (
+            "Or filters that know later samples have made these (filtfilt, decimate, "
+            "moving means): the model of a loop alternates as no plant does. Use "
+            "causal filters, the same for inputs and outputs, or none. "
+        )
     loop = choices.feedthrough is True and feedback.instantaneous
     within = (
         "The input answers outputs within the sample, and these do not answer it (p = "

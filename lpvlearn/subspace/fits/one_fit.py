@@ -147,7 +147,7 @@ class Samples(NamedTuple):
         That takes as long as the first choice. Few steps lead from the model `fitted`
         to one of its order, and to those without each one of the modes that may be
         constants: unless these tell nothing of other orders, one of them must be
-        promising.
+        promising, or one of a state less that begins at its own subspace.
         """
         evidence, horizon = fitted.evidence, fitted.selection.horizon
         others = without_slow_modes(evidence)
@@ -168,7 +168,11 @@ class Samples(NamedTuple):
 
         try:
             own = evidence.model.A, evidence.model.C
-            return any(promising(near(A, C)) for A, C in [own, *others])
+            if any(promising(near(A, C)) for A, C in [own, *others]):
+                return True
+            lower = len(evidence.model.A) - 1
+            anew = same.having(order=lower)
+            return lower > 0 and promising(anew.fit(n_trend, fitted))
         except TooFewSamples:  # for that horizon
             return True
 
