@@ -4,6 +4,8 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from sklearn.base import clone
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -16,7 +18,8 @@ from lpvlearn import (
     bft_score,
     from_trajectories,
 )
-from lpvlearn.pipeline.one_basis.branches import smoothest_family
+from lpvlearn.pipeline.one_basis.branches import smoothest_family, tied_branches
+from lpvlearn.restructuring.problem import problem_from_models
 
 NOISE = 0.01
 
@@ -373,3 +376,33 @@ def test_parts_that_are_the_same_at_all_points_have_no_mirror_image():
     coils_pipeline(structure, init="similarity").fit(
         *from_trajectories(runs, sampling_time=STEP)
     )
+
+
+def test_a_lag_that_may_have_any_of_several_poles_is_told():
+    """No permutation of the parameters: the rest of the model follows."""
+    structure = GrayBoxStructure.from_template(
+        A=[[0, 1, 0], ["-a0", "-a1", "b"], [0, 0, "-p"]],
+        B=[[0], [0], ["p"]],
+        C=[[1, 0, 0]],
+    )
+    kappa = np.linspace(0.0, 1.0, 4)[:, None]
+    pole = 5.0 * (1.0 + kappa[:, 0])
+    truth = np.column_stack(
+        [2.0 * pole, 2.0 + pole, 0.0 * pole + 20.0, 0.0 * pole + 12]
+    )
+    models = [structure.model(theta) for theta in truth]
+    problems = [problem_from_models(structure, [model], None) for model in models]
+    slow = np.column_stack([12.0 * pole, 12.0 + pole, 0.0 * pole + 120, 0.0 * pole + 2])
+    restructurer = GrayBoxRestructurer(structure, norm="h2")
+    fitted = [
+        clone(restructurer).set_params(init=theta).fit_model(model)
+        for theta, model in zip(slow, models, strict=True)
+    ]
+    for one in fitted:  # as if nothing had been known
+        one.init = "similarity"
+    _, doubts = tied_branches(problems, fitted, [None] * 4, kappa)
+    assert [doubt.point for doubt in doubts] == [0, 1, 2, 3]
+    for doubt, model in zip(doubts, models, strict=True):
+        other = structure.model(doubt.other)
+        assert_allclose(other.dc_gain(), model.dc_gain(), rtol=1e-6)
+        assert_allclose(np.sort(other.poles()), np.sort(model.poles()), rtol=1e-6)

@@ -47,6 +47,7 @@ _EQUAL, _EXACT, _OTHER, _TINY = 1.02, 1e-9, 1e-2, 1e-6
 _OPTIMA = 6  # of a point at most, apart from interchanges
 _FEW = 8  # parameters of which any two may be exchanged
 _SWEEPS = 4  # over the points: optima travel that far
+_SCATTERED, _SPREAD = 12, 1.0  # starts about an optimum, by factors of e or so
 
 # Prior of a parameter over the scheduling range, in units of its spread: the level, the
 # change of its line, and what bends: its sizes, its lengths, and noise beside the known
@@ -59,7 +60,7 @@ _UNKNOWN = 1e6  # variance, in squares of the spread, from which a value says no
 _KEPT = 200  # families of every length
 _WEIGHED = 24  # of them whose evidence is computed, for each prior of the search
 _CERTAIN = 0.95  # probability of the choice from which no more is said
-_WHOLE = 1e-3  # and of other parameters at all points, which may be as smooth by nature
+_WHOLE = 1e-8  # and of other parameters at all points, which may be as smooth by nature
 _TELLS = 0.05  # difference of two choices, in the spread of a parameter, that matters
 _DEVIATIONS = 3.0  # and in its standard deviations
 
@@ -106,16 +107,16 @@ def tied_branches(
         return [Branch(None, None)] * len(fitted), []
     low, high = structure.lower, structure.upper
     candidates, variances, origins = [], [], []
-    for found, P in zip(optima, covariances, strict=True):
+    for problem, found, P in zip(problems, optima, covariances, strict=True):
         known = np.zeros((structure.n_params,) * 2) if P is None else P
-        spread = np.where(np.isnan(np.diag(known)), 0.0, np.diag(known))
+        spread = _variances(problem, found, known)
         # the optima first, then those with interchanged parts
         origin = [(i, pi) for pi in places for i in range(len(found))]
         rows = np.array([found[i][pi] for i, pi in origin])
         inside = np.asarray(((rows >= low) & (rows <= high)).all(1), dtype=bool)
         inside[0] = True
         candidates.append(rows[inside])
-        variances.append(np.array([spread[pi] for _, pi in origin])[inside])
+        variances.append(np.array([spread[i][pi] for i, pi in origin])[inside])
         origins.append([origin[i] for i in np.flatnonzero(inside)])
     # without bounds the parts of a whole family may be numbered in any way
     n_first = (
@@ -145,6 +146,30 @@ def tied_branches(
     ]
 
 
+def _variances(
+    problem: RestructuringProblem, optima: Sequence[Array], known: Array
+) -> Array:
+    """Of the parameters of optima, of the covariance of the first of them.
+
+    What noise does to the response, ``J dtheta`` with J its derivatives, is the same at
+    all. Those of the first where that is not known; zero where nothing is.
+    """
+    own = np.where(np.isnan(np.diag(known)), 0.0, np.diag(known))
+    found = [own] * len(optima)
+    if len(optima) > 1 and np.isfinite(known).all():
+        first, *others = (_derivatives(problem, theta) for theta in optima)
+        changes = [np.linalg.lstsq(J, first)[0] for J in others]
+        found[1:] = [np.maximum(np.diag(M @ known @ M.T), 0.0) for M in changes]
+    return np.array(found)
+
+
+def _derivatives(problem: RestructuringProblem, theta: Array) -> Array:
+    """Of the response by the parameters, real and imaginary parts."""
+    J = problem.system.response_jacobian(theta, problem.omega)[1]
+    J = J.reshape(-1, J.shape[-1])
+    return np.vstack([J.real, J.imag])
+
+
 def _equal_optima(
     problems: Sequence[RestructuringProblem],
     fitted: Sequence[Any],
@@ -168,10 +193,13 @@ def _equal_optima(
     edges = sorted([*edges, *((j, i) for i, j in edges)])
     beside = [[j for i, j in edges if i == k] for k in range(len(kappa))]
     waiting = [(i, starts[j]) for i, j in edges]
+    root = int(order[0])
+    most = _EQUAL * least[root]
     if len(places) == 1:
-        root = int(order[0])
-        for pi in _exchanges(problems[root], starts[root], _EQUAL * least[root]):
+        for pi in _exchanges(problems[root], starts[root], most):
             waiting += [(k, start[pi]) for k, start in enumerate(starts)]
+    for other in _elsewhere(problems[root], starts[root], most, places):
+        waiting += [(k, other) for k in range(len(starts))]
     for _ in range(_SWEEPS):
         new = []
         for i, start in waiting:
@@ -218,6 +246,25 @@ def _exchanges(
             found = np.vstack([found, fit.x])
             kept.append(pi)
     return kept
+
+
+def _elsewhere(
+    problem: RestructuringProblem, theta: Array, most: float, places: Choices
+) -> list[Array]:
+    """Other optima of at most that error, from starts about the one that is known.
+
+    As where a lag may have any of several poles, and the rest of a model follows.
+    """
+    rng, found = np.random.default_rng(0), [theta]
+    lower, upper = problem.structure.lower, problem.structure.upper
+    for _ in range(_SCATTERED):
+        start = theta * np.exp(_SPREAD * rng.standard_normal(len(theta)))
+        fit = problem.fit(np.clip(start, lower, upper))
+        if fit is None or fit.relative_error > most:
+            continue
+        if _is_other(fit.x, np.vstack([one[places] for one in found])):
+            found.append(fit.x)
+    return found[1:]
 
 
 def _numbering(
