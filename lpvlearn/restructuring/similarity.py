@@ -4,12 +4,16 @@ A similarity T takes the black box to ``(T A T^-1, T B, C T^-1)``. Rows of A and
 entries of B, that hold no parameter give equations linear in T. They are solved
 exactly, ``T = T_0 + sum_l z_l N_l``; what remains of the distance to the affine
 structure is minimised over z by a Levenberg-Marquardt method, from many starts at once.
+
+Where they are more than a noisy black box can meet, as two inputs that reach one state
+out of two and should be in proportion, only a singular T solves them. They are solved
+by total least squares then, with as many z as a model of the structure leaves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +22,12 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
-from ..systems.least_squares import Residuals, levenberg_marquardt, scaled_lstsq
+from ..systems.least_squares import (
+    Residuals,
+    column_scale,
+    levenberg_marquardt,
+    scaled_lstsq,
+)
 from .deadline import time_is_up
 from .error_system import Structure, Target, derivatives, response_point
 
@@ -29,6 +38,14 @@ _EXACT = 4  # starts that reach the structure exactly; no more are needed
 
 # relative singular value of the linear equations that noise of a black box may leave
 _NULL_TOLERANCE = 1e-6
+
+# Relative singular value of a T that is singular but for rounding: 1e-16 over the least
+# singular value of the equations that is none.
+_SINGULAR = 1e-9
+
+# Weight of the distance of z to its start, relative to the size of the start: what the
+# structure leaves open (the unit of a state) stays there, and nothing else heeds it.
+_STAYING = 1e-6
 
 # A start ends when its squared distance falls by less than _SLOW that often in a row:
 # far from the structure progress is slow and then fast again.
@@ -133,16 +150,23 @@ def similarity_starts(
     M, b = linear_equations(problem)
     T0 = np.linalg.lstsq(M, b, rcond=None)[0] if len(b) else np.zeros(n * n)
     N = null_space(M, rcond=_NULL_TOLERANCE) if len(b) else np.eye(n * n)
-    size = np.linalg.norm(T0) / n if T0.any() else 1.0
-    if N.shape[1] == 0:
-        Z = np.zeros((1, 0))
-    else:
-        spread = size * 10 ** rng.uniform(-1, 1, size=(n_starts, 1))
-        Z = rng.normal(size=(n_starts, N.shape[1])) * spread
+    Z = _draws(T0, N, n_starts, rng)
     flat = problem.basis.reshape(len(problem.basis), -1)
     directions = np.linalg.qr(flat.T)[0]
+    distances = _distances(problem, T0, N, directions)
+    nearest = False
+    if not _any_regular((T0 + Z @ N.T).reshape(-1, n, n)):
+        rank = _own_rank(problem)
+        nearest = rank < n * n - N.shape[1]
+    if nearest:
+        T0, N = _nearest_solutions(M, b, rank)
+        Z = _draws(T0, N, n_starts, rng)
+        # what the equations leave is theirs: z would lessen it by states of no size
+        held = np.eye(problem.offset.size)[_in_equations(problem).ravel()]
+        others = np.hstack([directions, held.T])
+        distances = _staying(_distances(problem, T0, N, others), Z)
     Z, cost = levenberg_marquardt(
-        _distances(problem, T0, N, directions),
+        distances,
         Z,
         max_iter=_MAX_ITER,
         tol=_SLOW,
@@ -155,10 +179,69 @@ def similarity_starts(
     if len(Z) == 0:
         return np.zeros((0, len(flat))), cost
     d = _transformed(problem, (T0 + Z @ N.T).reshape(-1, n, n))[0]
+    if nearest:
+        rest = d - (d @ directions) @ directions.T
+        cost = np.einsum("ij,ij->i", rest, rest)
     theta = nearest_parameters(problem, d)
     good = np.isfinite(theta).all(1)
     order = np.argsort(cost[good], kind="stable")
     return theta[good][order], np.sqrt(cost[good][order])
+
+
+def _draws(T0: Array, N: Array, n_starts: int, rng: np.random.Generator) -> Array:
+    """Random z, (n_starts, n_z); one without entries where there is no choice."""
+    if N.shape[1] == 0:
+        return np.zeros((1, 0))
+    size = np.linalg.norm(T0) / np.sqrt(len(T0)) if T0.any() else 1.0
+    spread = size * 10 ** rng.uniform(-1, 1, size=(n_starts, 1))
+    return np.asarray(rng.normal(size=(n_starts, N.shape[1])) * spread)
+
+
+def _any_regular(T: Array) -> bool:
+    """Whether any of stacked matrices is regular, beyond rounding."""
+    s = np.linalg.svd(T[np.isfinite(T).all((1, 2))], compute_uv=False)
+    return bool((s[:, -1] > _SINGULAR * s[:, 0]).any())
+
+
+def _own_rank(problem: AffineProblem) -> int:
+    """Rank of the linear equations of the structure's own models, which meet them all.
+
+    Of one with random parameters, as of all but special ones. That of all unknowns
+    where no input moves it, or no output shows it: it is similar to no black box.
+    """
+    n = len(problem.A)
+    size = np.abs(problem.basis).max((1, 2), initial=0.0)
+    rng = np.random.default_rng(0)
+    theta = rng.normal(size=len(size)) / np.where(size > 0, size, 1.0)
+    S = problem.offset + np.tensordot(theta, problem.basis, axes=1)
+    if not (S[:n, n:].any() and S[n:, :n].any()):
+        return n * n
+    own = replace(problem, A=S[:n, :n], B=S[:n, n:], C=S[n:, :n])
+    M = _of_length_one(*linear_equations(own))[0]
+    return int(np.linalg.matrix_rank(M, rtol=_NULL_TOLERANCE))
+
+
+def _of_length_one(M: Array, b: Array) -> tuple[Array, Array]:
+    """Equations that count alike, whatever the units of inputs and outputs are."""
+    length = column_scale(M.T)
+    return M / length[:, None], b / length
+
+
+def _nearest_solutions(M: Array, b: Array, rank: int) -> tuple[Array, Array]:
+    """T_0 and the N_l of the nearest equations of that rank (a truncated SVD)."""
+    M, b = _of_length_one(M, b)
+    U, s, Vt = np.linalg.svd(M)
+    T0 = Vt[:rank].T @ ((U.T @ b)[:rank] / s[:rank])
+    return T0, Vt[rank:].T
+
+
+def _in_equations(problem: AffineProblem) -> NDArray[np.bool_]:
+    """The entries of the system matrix that the linear equations hold."""
+    n = len(problem.A)
+    held = ~(problem.basis != 0).any(0)
+    held[:, :n] = held[:, :n].all(1, keepdims=True)
+    held[n:, n:] = False
+    return held
 
 
 def nearest_parameters(problem: AffineProblem, d: Array) -> Array:
@@ -212,6 +295,24 @@ def _distances(
             return rest(J.reshape(*J.shape[:2], problem.offset.size)).swapaxes(1, 2)
 
         return r, jacobian
+
+    return residuals
+
+
+def _staying(distances: Residuals, starts: Array) -> Residuals:
+    """Distances, and by how much z leaves its start, faintly."""
+    size = np.linalg.norm(starts, axis=1, keepdims=True)
+    weight = _STAYING / np.where(size > 0, size, 1.0)
+
+    def residuals(z: Array, rows: Any) -> tuple[Array, Callable[..., Array]]:
+        r, jacobian = distances(z, rows)
+        own = weight[rows]
+
+        def with_stay(kept: Array) -> Array:
+            stay = own[kept, :, None] * np.eye(z.shape[1])
+            return np.concatenate([jacobian(kept), stay], axis=1)
+
+        return np.hstack([r, own * (z - starts[rows])]), with_stay
 
     return residuals
 

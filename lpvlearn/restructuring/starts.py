@@ -137,6 +137,12 @@ def search(
             "A or `D` of equations of motion; where it is small, bound it by what is "
             "known of it."
         )
+    if guess is None and not only_given:
+        rng = np.random.default_rng(seed)
+        drawn = list(_natural_starts(problem, n_starts, rng))
+        fits, certain = _rounds(problem, guess, n_starts, drawn, rng, enough)
+        if fits:
+            return Search(problem, fits, certain)
     begun = given if only_given else [guess]
     worst = None if begun[0] is None else _worst_pole(problem, begun[0])
     if worst is not None:
@@ -152,7 +158,8 @@ def search(
         )
     raise ValueError(
         "no stable starting point was found for `structure`. Give `init`, a vector of "
-        f"parameters of a stable model, or raise `n_starts` (got {n_starts})."
+        "parameters of a stable model, bounds or ranges that tell signs and sizes "
+        f"(with_bounds, with_ranges), or raise `n_starts` (got {n_starts})."
         + DISCRETE_BOX
         * (problem.system.dt is not None)
     )
@@ -193,9 +200,12 @@ def _without_effect(
 ) -> list[str]:
     """Names of the parameters that change no response at a random point."""
     structure = problem.structure
-    theta = np.clip(
-        rng.normal(size=structure.n_params), structure.lower, structure.upper
-    )
+    lower, upper = structure.lower, structure.upper
+    theta = rng.normal(size=structure.n_params)
+    # mirrored at a bound: at zero itself others may have no effect
+    theta = np.where(theta < lower, 2.0 * lower - theta, theta)
+    theta = np.where(theta > upper, 2.0 * upper - theta, theta)
+    theta = np.clip(theta, lower, upper)
     J = problem.system.response_jacobian(theta, problem.omega)[1]
     effect = np.abs(np.nan_to_num(J, nan=1.0)).max((0, 1, 2))
     return [n for n, e in zip(structure.parameter_names, effect, strict=True) if e == 0]
@@ -530,7 +540,8 @@ def continuation_candidates(
     physical = seeds[(seeds > 0).all(1)][:count] if equations else nothing
     if isinstance(structure.map, AffineMap) and (thorough or signed.any()):
         sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
-        drawn = _natural_sizes(box, structure.map, structure.order, count, rng)
+        S, basis = structure.map.offset, structure.map.basis
+        drawn = _natural_sizes(box, S, basis, structure.order, count, rng)
         physical = drawn * np.where(sign == 0, 1.0, sign)
         free = rng.choice([-1.0, 1.0], drawn.shape)
         rows.append(drawn * np.where(sign == 0, free, sign))
@@ -552,12 +563,38 @@ def has_sign(structure: GrayBoxStructure) -> NDArray[np.bool_]:
     return (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
 
 
+def _natural_starts(
+    problem: RestructuringProblem, count: int, rng: np.random.Generator
+) -> Array:
+    """Random parameters of an affine structure of which the black box gives no start.
+
+    Of the sizes that its poles and the gains of its inputs make natural. Of half of
+    them those whose sign no bound tells are positive, as physical ones are.
+    """
+    structure, box, n = problem.structure, problem.box, problem.structure.order
+    if not isinstance(structure.map, AffineMap) or box is None:
+        return np.zeros((0, structure.n_params))
+    gains = np.sqrt(np.mean(np.abs(problem.response) ** 2, axis=0)).max(0)
+    unit = np.append(np.ones(n), 1.0 / np.where(gains > 0, gains, 1.0))
+    S, basis = structure.map.offset * unit, structure.map.basis * unit
+    drawn = _natural_sizes(box, S, basis, n, count, rng)
+    free = rng.choice([-1.0, 1.0], drawn.shape)
+    free[::2] = 1.0
+    below = (structure.upper <= 0) | (structure.ranges[0] < 0)
+    return drawn * np.where(has_sign(structure), np.where(below, -1.0, 1.0), free)
+
+
 def _natural_sizes(
-    box: Target, affine: AffineMap, order: int, count: int, rng: np.random.Generator
+    box: Target,
+    offset: Array,
+    basis: Array,
+    order: int,
+    count: int,
+    rng: np.random.Generator,
 ) -> Array:
     """Random sizes of parameters that bring all entries of the structure near one."""
     rate = mean_rate(np.abs(np.linalg.eigvals(box.A)))
     full = _padded(_reduced(box, order), order, rng, (_FAINT, _FAINT))
-    problem = scaled_problem(full, affine.offset, affine.basis, rate)
+    problem = scaled_problem(full, offset, basis, rate)
     size = 1.0 / np.abs(problem.basis).max((1, 2))
     return np.asarray(size * np.exp(rng.normal(size=(count, len(size)))))

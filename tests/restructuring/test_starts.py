@@ -221,3 +221,84 @@ def test_a_flat_point_that_is_the_optimum_is_kept():
         fitted = GrayBoxRestructurer(structure).fit_model(StateSpace(-1, 1, 0.5))
     assert fitted.error_ == pytest.approx(0.5)
     assert fitted.lower_bound_ == 0.0
+
+
+NETWORKS = {  # inputs of which most act on one state
+    "air and wall": (
+        [["-g - go", "g"], ["h", "-h - w"]],
+        [["b", "s", "go"], [0, 0, "w"]],
+        [[1, 0]],
+        {"g": 2.7, "go": 0.2, "h": 0.6, "w": 0.3, "b": 3.3, "s": 2.0},
+    ),
+    "air, wall and slab": (
+        [["-g - k - go", "g", "k"], ["h", "-h - w", 0], ["l", 0, "-l"]],
+        [["b", "s", "p", "go", 0], [0, 0, 0, "w", 0], [0, 0, 0, 0, "f"]],
+        [[1, 0, 0]],
+        {"g": 2.0, "k": 0.8, "go": 0.3, "h": 0.4, "w": 0.2, "l": 0.15, "f": 0.3}
+        | {"b": 3.0, "s": 1.0, "p": 0.5},
+    ),
+    "three tanks": (
+        [["-a", "b", 0], ["a", "-b - c", "d"], [0, "c", "-d - e"]],
+        [["p", "q", "r", "s"], [0, 0, 0, "t"], [0, 0, 0, 0]],
+        [[1, 0, 0]],
+        {"a": 1.2, "b": 0.6, "c": 0.7, "d": 0.4, "e": 0.5}
+        | {"p": 1.0, "q": 0.6, "r": 0.4, "s": 0.3, "t": 0.8},
+    ),
+}
+
+
+def network(name, size, seed=0):
+    """Its structure, and a black box that is one of its models but for noise."""
+    A, B, C, params = NETWORKS[name]
+    structure = GrayBoxStructure.from_template(A, B, C)
+    model, rng = structure.model(params), np.random.default_rng(seed)
+    A, B, C = (
+        M + size * np.abs(M).max() * rng.normal(size=M.shape)
+        for M in (model.A, model.B, model.C)
+    )
+    return structure, model, StateSpace(A, B, C, model.D).balance()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("size", [1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("positive", [False, True])
+def test_noise_on_inputs_of_one_state_leaves_a_start(name, size, positive):
+    """The gray box is no farther from the black box than the truth is."""
+    structure, truth, box = network(name, size)
+    if positive:
+        names = structure.parameter_names
+        structure = structure.with_bounds(dict.fromkeys(names, (0, None)))
+    fitted = GrayBoxRestructurer(structure).fit_model(box)
+    omega = np.logspace(-3, 2, 200)
+    G = box.frequency_response(omega)
+    of_truth, of_fit = (
+        np.linalg.norm(model.frequency_response(omega) - G, 2, axis=(1, 2)).max()
+        for model in (truth, fitted.lti_)
+    )
+    assert of_fit <= 1.01 * of_truth
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("positive", [False, True])
+def test_sizes_of_the_black_box_are_starts_where_there_are_no_others(
+    monkeypatch, name, positive
+):
+    def nothing(box, affine, *_):
+        return np.zeros((0, len(affine.basis)))
+
+    monkeypatch.setattr(starts, "_similar_candidates", nothing)
+    structure, truth, _ = network(name, 0.0)
+    if positive:
+        names = structure.parameter_names
+        structure = structure.with_bounds(dict.fromkeys(names, (0, None)))
+    fitted = GrayBoxRestructurer(structure).fit_model(truth)
+    assert fitted.error_ <= 1e-6 * truth.hinf_norm()
+
+
+def test_a_parameter_beside_bounds_at_zero_is_not_taken_for_silent():
+    """At b = 0, in a corner of the bounds, no derivative sees the others."""
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
+    structure = structure.with_bounds(dict.fromkeys("abc", (0, None)))
+    problem = problem_from_models(structure, [StateSpace(-2, 3, 1)], None)
+    for seed in range(20):
+        assert starts._without_effect(problem, np.random.default_rng(seed)) == []
