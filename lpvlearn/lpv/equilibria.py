@@ -53,6 +53,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import null_space
 
 from ..models.statespace import StateSpace
+from ..systems.balancing import gramian_factor
 from .alignment import spanning_tree
 from .left_out import inner_places
 
@@ -82,6 +83,9 @@ _AT_ONCE = 0.1  # of the outputs' motion: what inputs do at once that hardly mat
 
 # Scheduling values of which there are logarithms and inverses
 _POSITIVE = 1e-100
+
+# Places from which a line tells more than the mean of those that it goes through
+_TOLD_APART = 3
 
 # Range of constants of sensors over the points that are one, by that of the outputs
 _SAME_CONSTANT = 0.05
@@ -148,7 +152,44 @@ def points_of_work(
         return np.hstack([inputs, outputs, x0])
     bias = _bias_of_sensors(inputs, outputs, gains, statics.inverse, u_scale)
     x0 = statics.states_at_rest(inputs, outputs - bias)
+    shown = _times(statics.moved @ statics.inverse, outputs - outputs.mean(axis=0))
+    held = x0 - shown
+    if _are_one_state(held, models, kappa, y_scale):
+        x0 = shown + held.mean(axis=0)
     return np.hstack([inputs, outputs, x0])
+
+
+def _are_one_state(
+    states: Array, models: Sequence[StateSpace], kappa: Array, y_scale: Array
+) -> bool:
+    """Whether states (n_points, order) are the same at all points, but for noise.
+
+    Where no plain curve through the others foresees one clearly better than their mean
+    does: by the outputs that follow from the errors. Not where models are unstable.
+    """
+    if len(np.unique(kappa, axis=0)) < _TOLD_APART:
+        return False
+    try:
+        pairs = [(m.A.T, (m.C / y_scale[:, None]).T) for m in models]
+        factors = np.array([gramian_factor(*pair, False).T for pair in pairs])
+    except ValueError:
+        return False
+
+    def error(terms: Array) -> float:
+        """Of points left out, of a linear form in `terms` (n_points, n_terms)."""
+        left = np.eye(len(terms)) - terms @ np.linalg.pinv(terms)
+        alone = np.diag(left)[:, None]
+        if alone.min() < _ROUNDING:  # the others do not tell the form
+            return np.inf
+        return float(np.sum(_times(factors, left @ states / alone) ** 2))
+
+    one = np.ones((len(kappa), 1))
+    plain = [kappa - kappa.mean(axis=0)]
+    if (kappa > _POSITIVE).all():
+        plain += [np.log(kappa), 1.0 / kappa]
+    curves = [np.hstack([one, x]) for x in plain]
+    curves.append(np.hstack([one, plain[0], plain[0] ** 2]))
+    return min(map(error, curves)) > _BETTER * error(one)
 
 
 def _measure_all_states(

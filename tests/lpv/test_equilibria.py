@@ -345,3 +345,39 @@ def test_one_constant_of_the_sensors_is_no_family(seed):
     x = np.hstack([gain[:, None] * u, 0.5 * gain[:, None] * u])
     found = points_of_work(models, kappa, u, 2.0 * x[:, 1:] + 5.0, ONE)
     np.testing.assert_allclose(np.diff(found[:, 2:], axis=0), np.diff(x, axis=0))
+
+
+def mixed(flow, rng, part=0.01):
+    """A stream that is dosed, and a sensor whose slope is known to a part."""
+    slope, rate = 2.0 * (1.0 + part * rng.standard_normal()), 0.1
+    return StateSpace([[-flow, 0], [slope * rate, -rate]], [[1.0], [0]], [[0, 1.0]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_held_at_a_set_point_has_one_state_at_rest(seed):
+    """Inputs of hundreds of motions, times what is not known of the models."""
+    rng = np.random.default_rng(seed)
+    flow = np.linspace(1.0, 2.2, 5)[:, None]
+    models = [mixed(f, rng) for f in flow[:, 0]]
+    u0, y0 = 100.0 * flow, 6.0 + 0.05 * rng.standard_normal(flow.shape)
+    found = points_of_work(models, flow, u0, y0, ONE)
+    assert_allclose(found[:, :2], np.hstack([u0, y0]))
+    # the states of the sensor follow its outputs, those before it by its slope
+    assert_allclose(np.diff(found[:, 3]), np.diff(y0[:, 0]), atol=1e-9)
+    assert_allclose(found[:, 2], found[:, 2].mean(), atol=0.1)
+
+
+@pytest.mark.parametrize("n_points", [3, 5])
+def test_a_state_that_moves_while_the_output_is_held_moves_at_rest(n_points):
+    """A heater in a stream that it keeps at one temperature: hotter with more."""
+    rng = np.random.default_rng(0)
+    flow = np.linspace(1.0, 2.2, n_points)[:, None]
+    models = [
+        StateSpace([[-h, h], [h, -h - f]], [[1.0], [0.0]], [[0.0, 1.0]])
+        for f in flow[:, 0]
+        for h in [5.0 * (1.0 + 0.01 * rng.standard_normal())]
+    ]
+    u0, y0 = 35.0 * flow, np.full_like(flow, 50.0)
+    found = points_of_work(models, flow, u0, y0, ONE)
+    assert_allclose(np.diff(found[:, 2]), np.diff(u0[:, 0]) / 5.0, atol=0.35)
+    assert_allclose(np.ptp(found[:, 3]), 0.0, atol=1e-9)
