@@ -173,7 +173,10 @@ round(bft_score(data.y_large, y), 1)
 # equilibria bend more than the equations do (currents of a drive are rational in its
 # speed, the back-EMF is linear), the constants of :math:`\dot x = A x + B u + c` are
 # splines instead, if these tell points that are left out clearly better: of one
-# scheduling variable, from five points on.
+# scheduling variable, from five points on. So are inputs over their own logarithm, or
+# over one over them (a valve that nearly saturates). Where the best of these misses
+# outputs at rest, of points that are left out, by more than experiments move them,
+# ``fit`` says so.
 #
 # A rate alone does not tell where a system stands: if the scheduling variable is a
 # position, measure that as an output, too.

@@ -381,3 +381,53 @@ def test_a_state_that_moves_while_the_output_is_held_moves_at_rest(n_points):
     found = points_of_work(models, flow, u0, y0, ONE)
     assert_allclose(np.diff(found[:, 2]), np.diff(u0[:, 0]) / 5.0, atol=0.35)
     assert_allclose(np.ptp(found[:, 3]), 0.0, atol=1e-9)
+
+
+FEED = np.linspace(8.0, 12.0, 5)[:, None]
+
+
+def condenser(feed):
+    """A pressure, and cooling that hardly acts where its valve is nearly open."""
+    return StateSpace(-1.0, -5.0 * saturating(feed) ** -2, 1.0)
+
+
+def saturating(feed):
+    """A flow, from 2 to 40, of which one over it is linear."""
+    return 1.0 / (0.5 - 0.475 * (np.ravel(feed)[0] - 8.0) / 4.0)
+
+
+def test_inputs_that_saturate_are_followed_over_one_over_them():
+    """And outputs that stand where they are do so between the points."""
+    u0 = np.array([[saturating(f)] for f in FEED])
+    y0 = np.full_like(u0, 25.0)
+    scales = np.array([0.3]), np.array([0.2])
+    values = np.hstack([u0, y0, y0])
+
+    def spline():
+        return SplineLPV("cubic")
+
+    found = interpolated(spline, FEED, values, condenser, scales, tell=True)
+    between = 0.5 * (FEED[1:] + FEED[:-1])
+    u, y, x = found.predict(between).T
+    assert_allclose(u, [saturating(f) for f in between], rtol=1e-6)
+    assert_allclose([y, x], 25.0, rtol=1e-9)
+    alone = spline().fit(FEED, values).predict(between)[:, 0]
+    assert np.abs(alone / u - 1.0).max() > 0.1
+
+
+def test_points_that_no_curve_foresees_are_told():
+    """A valve that sticks at one of the points."""
+    values = np.hstack([FEED, 25.0 + 0.0 * FEED, 25.0 + 0.0 * FEED])
+    scales = np.array([0.3]), np.array([0.2])
+
+    def first_order(feed):
+        return StateSpace(-1.0, 1.0, 1.0)
+
+    def spline():
+        return SplineLPV("cubic")
+
+    smooth = interpolated(spline, FEED, values, first_order, scales, tell=True)
+    assert_allclose(smooth.predict(FEED + 0.5)[:4, 0], FEED[:4, 0] + 0.5)
+    values[2, 0] += 30.0
+    with pytest.warns(UserWarning, match="miss output 0 at rest by .* Measure in"):
+        interpolated(spline, FEED, values, first_order, scales, tell=True)
