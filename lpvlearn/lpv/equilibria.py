@@ -333,7 +333,7 @@ def interpolated(
         if least > _BENT and error < share * least:
             best, least, of_best = way, error, missed
     if tell and of_best:
-        _tell_missed(of_best, points, scales[1])
+        _tell_missed(of_best, points, scales)
     if best is ways[0][0]:
         return by_themselves
     found = best(points)
@@ -393,18 +393,29 @@ def _missed_at_rest(way: _Way, points: _Points, y_scale: Array) -> dict[int, Arr
     return errors
 
 
-def _tell_missed(missed: dict[int, Array], points: _Points, y_scale: Array) -> None:
-    """Tell of the point whose outputs at rest are missed most."""
-    k = max(missed, key=lambda k: float(missed[k].max()))
-    i = int(missed[k].argmax())
-    if missed[k][i] > _MISSED:
-        off, moves = missed[k][i] * y_scale[i], y_scale[i]
+def _tell_missed(
+    missed: dict[int, Array], points: _Points, scales: tuple[Array, Array]
+) -> None:
+    """Tell of the point whose output at rest is missed most.
+
+    By what experiments move it, or would, if it settled: that may be far more.
+    """
+    u_scale, y_scale = scales
+    off = {k: error * y_scale for k, error in missed.items()}
+    moves = {
+        k: np.hypot(y_scale, np.linalg.norm(gain * u_scale, axis=1))
+        for k in missed
+        for gain in [points.models[k].dc_gain()]
+    }
+    k = max(missed, key=lambda k: float(np.max(off[k] / moves[k])))
+    i = int(np.argmax(off[k] / moves[k]))
+    if off[k][i] > _MISSED * moves[k][i]:
         names = points.models[k].output_names or range(len(y_scale))
         warn(
             "equilibria between the operating points are a guess: without point "
             f"{k} (scheduling {points.kappa[k, 0]:.4g}) the others miss output "
-            f"{names[i]!r} at rest by {off:.3g}, where "
-            f"experiments move it by {moves:.3g}. Measure in between "
+            f"{names[i]!r} at rest by {off[k][i]:.3g}, where the motion of the "
+            f"experiments is worth {moves[k][i]:.3g}. Measure in between "
             "(`suggest_operating_point`), or give a scheduling variable over which "
             "inputs and outputs at rest are smoother."
         )
