@@ -16,7 +16,12 @@ not reach stays an offset of the sensors. Inputs of which the outputs tell nothi
   and ``dx0 = -A^-1 B du0``.
 - They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
   same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
-  is taken by which there is less to hold.
+  is taken by which there is less to hold. Of ``x0 = S (y0 - m) + S (m - c)``, with the
+  mean m of the outputs, the second part is S, which parameters tell, times what may be
+  hundreds of motions (a set point held at all flows). Where points left out are not
+  foreseen better than by its mean, it is noise, and its mean is taken. So it is of
+  black boxes, whose basis may turn from point to point, where outputs stand about one
+  level.
 
 Outputs that measure all states, by one C at all points and hardly a D, tell x0
 themselves, whatever it is that holds it there (a source, a feed, that is no input):
@@ -105,6 +110,10 @@ _SAME_CONSTANT = 0.05
 # how far, in that of the outputs, a gain that is known takes them to a common one.
 STANDING, _FAR = 0.1, 3.0
 
+# Variance of outputs at rest, in that of their motion, up to which all experiments move
+# about one level of theirs
+_HELD = 1.0
+
 
 def points_of_work(
     models: Sequence[StateSpace],
@@ -112,11 +121,14 @@ def points_of_work(
     inputs: Array,
     outputs: Array,
     scales: tuple[Array, Array],
+    *,
+    structured: bool = True,
 ) -> Array:
     """``[u0, y0, x0]`` of models, (n_points, n_inputs + n_outputs + order).
 
     From equilibria, `inputs` (n_points, n_inputs) and `outputs` (n_points, n_outputs);
-    `scales` are the sizes of the motions of inputs and outputs.
+    `scales` are the sizes of the motions of inputs and outputs. States of models that
+    are not `structured` are those of a basis that may turn over kappa.
 
     Examples
     --------
@@ -165,7 +177,9 @@ def points_of_work(
     x0 = statics.states_at_rest(inputs, outputs - bias)
     shown = _times(statics.moved @ statics.inverse, outputs - outputs.mean(axis=0))
     held = x0 - shown
-    if _are_one_state(held, models, kappa, y_scale):
+    stand = np.all(np.var(outputs / y_scale, axis=0) <= _HELD)
+    # a basis that turns moves what stands still, by how far it is from zero
+    if (stand and not structured) or _are_one_state(held, models, kappa, y_scale):
         x0 = shown + held.mean(axis=0)
     return np.hstack([inputs, outputs, x0])
 

@@ -367,6 +367,19 @@ def test_what_is_held_at_a_set_point_has_one_state_at_rest(seed):
     assert_allclose(found[:, 2], found[:, 2].mean(), atol=0.1)
 
 
+def test_a_basis_that_turns_moves_no_state_that_is_held():
+    """Black boxes: what a turn makes of a state far from zero is none of its motion."""
+    rng = np.random.default_rng(0)
+    flow = np.linspace(1.0, 2.2, 5)[:, None]
+    turns = [np.array([[1.0, 0.1 * f], [-0.1 * f, 1.0]]) for f in flow[:, 0]]
+    models = [
+        mixed(f, rng).transform(T) for f, T in zip(flow[:, 0], turns, strict=True)
+    ]
+    work = models, flow, 100.0 * flow, np.full_like(flow, 6.0), ONE
+    assert_allclose(np.ptp(points_of_work(*work, structured=False)[:, 2:], axis=0), 0.0)
+    assert np.ptp(points_of_work(*work)[:, 2:], axis=0).min() > 1.0
+
+
 @pytest.mark.parametrize("n_points", [3, 5])
 def test_a_state_that_moves_while_the_output_is_held_moves_at_rest(n_points):
     """A heater in a stream that it keeps at one temperature: hotter with more."""
