@@ -158,6 +158,9 @@ round(bft_score(data.y_large, y), 1)
 #   gain is not, are those of the sensors, and leave the state alone. So is the constant
 #   of an output that does not answer at rest, :math:`G(0) = 0`: a rate, a
 #   high-pass. Where both would do, the state that is nearer to zero is taken.
+#   What the mean of the outputs makes of the state, with that constant, is one state at
+#   all points where points that are left out do not tell otherwise: a set point that
+#   inputs of hundreds of motions hold tells the noise of the parameters.
 # * **More outputs than inputs:** the best :math:`u_0 - w` in the least-squares sense,
 #   the rest are offsets of sensors. **More inputs than outputs:** the smallest
 #   :math:`w`, for inputs of which the outputs tell nothing are what they are.
@@ -170,7 +173,10 @@ round(bft_score(data.y_large, y), 1)
 # equilibria bend more than the equations do (currents of a drive are rational in its
 # speed, the back-EMF is linear), the constants of :math:`\dot x = A x + B u + c` are
 # splines instead, if these tell points that are left out clearly better: of one
-# scheduling variable, from five points on.
+# scheduling variable, from five points on. So are inputs over their own logarithm, or
+# over one over them (a valve that nearly saturates). Where the best of these misses
+# outputs at rest, of points that are left out, by more than experiments move them,
+# ``fit`` says so.
 #
 # A rate alone does not tell where a system stands: if the scheduling variable is a
 # position, measure that as an output, too.

@@ -16,7 +16,12 @@ not reach stays an offset of the sensors. Inputs of which the outputs tell nothi
   and ``dx0 = -A^-1 B du0``.
 - They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
   same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
-  is taken by which there is less to hold.
+  is taken by which there is less to hold. Of ``x0 = S (y0 - m) + S (m - c)``, with the
+  mean m of the outputs, the second part is S, which parameters tell, times what may be
+  hundreds of motions (a set point held at all flows). Where points left out are not
+  foreseen better than by its mean, it is noise, and its mean is taken. So it is of
+  black boxes, whose basis may turn from point to point, where outputs stand about one
+  level.
 
 Outputs that measure all states, by one C at all points and hardly a D, tell x0
 themselves, whatever it is that holds it there (a source, a feed, that is no input):
@@ -37,6 +42,8 @@ tells left-out points clearly better, it is not themselves:
   inputs at rest.
 - Where they bend less over the logarithm of the scheduling variable, or over one over
   it (a flow, a speed), these.
+- Where inputs do over their own logarithm, or over one over them (a valve that nearly
+  saturates), these.
 - Where they are those of one system that schedules itself (levels of a tank), a curve
   with the slopes that the models' gains tell: ``du0 = P dy0``.
 """
@@ -52,7 +59,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import null_space
 
+from ..exceptions import warn
 from ..models.statespace import StateSpace
+from ..systems.balancing import gramian_factor
 from .alignment import spanning_tree
 from .left_out import inner_places
 
@@ -61,6 +70,7 @@ Array = NDArray[np.float64]
 # What is at rest at scheduling values, of the frozen model there; how points tell it
 _AtRest: TypeAlias = "Callable[[Array, StateSpace], _Work]"
 _Way: TypeAlias = "Callable[[_Points], _AtRest]"
+_Pair: TypeAlias = "tuple[Callable[[Array], Array], Callable[[Array], Array]]"
 
 # Static gain, from motions of the inputs to those of the outputs, that is nothing.
 _STATIC = 0.01
@@ -83,12 +93,26 @@ _AT_ONCE = 0.1  # of the outputs' motion: what inputs do at once that hardly mat
 # Scheduling values of which there are logarithms and inverses
 _POSITIVE = 1e-100
 
+# Places from which a line tells more than the mean of those that it goes through
+_TOLD_APART = 3
+
+# Of the static gain between points: the part that it is seldom nearer than, which is of
+# inputs that are missed what outputs are missed by, whatever these make up for.
+_GAIN = 0.1
+
+# Motions by which the output at rest of a point is missed that are told
+_MISSED = 1.0
+
 # Range of constants of sensors over the points that are one, by that of the outputs
 _SAME_CONSTANT = 0.05
 
 # Variance of the levels of inputs over the points, in that of their motion: none. And
 # how far, in that of the outputs, a gain that is known takes them to a common one.
 STANDING, _FAR = 0.1, 3.0
+
+# Variance of outputs at rest, in that of their motion, up to which all experiments move
+# about one level of theirs
+_HELD = 1.0
 
 
 def points_of_work(
@@ -97,11 +121,14 @@ def points_of_work(
     inputs: Array,
     outputs: Array,
     scales: tuple[Array, Array],
+    *,
+    structured: bool = True,
 ) -> Array:
     """``[u0, y0, x0]`` of models, (n_points, n_inputs + n_outputs + order).
 
     From equilibria, `inputs` (n_points, n_inputs) and `outputs` (n_points, n_outputs);
-    `scales` are the sizes of the motions of inputs and outputs.
+    `scales` are the sizes of the motions of inputs and outputs. States of models that
+    are not `structured` are those of a basis that may turn over kappa.
 
     Examples
     --------
@@ -148,7 +175,46 @@ def points_of_work(
         return np.hstack([inputs, outputs, x0])
     bias = _bias_of_sensors(inputs, outputs, gains, statics.inverse, u_scale)
     x0 = statics.states_at_rest(inputs, outputs - bias)
+    shown = _times(statics.moved @ statics.inverse, outputs - outputs.mean(axis=0))
+    held = x0 - shown
+    stand = np.all(np.var(outputs / y_scale, axis=0) <= _HELD)
+    # a basis that turns moves what stands still, by how far it is from zero
+    if (stand and not structured) or _are_one_state(held, models, kappa, y_scale):
+        x0 = shown + held.mean(axis=0)
     return np.hstack([inputs, outputs, x0])
+
+
+def _are_one_state(
+    states: Array, models: Sequence[StateSpace], kappa: Array, y_scale: Array
+) -> bool:
+    """Whether states (n_points, order) are the same at all points, but for noise.
+
+    Where no plain curve through the others foresees one clearly better than their mean
+    does: by the outputs that follow from the errors. Not where models are unstable.
+    """
+    if len(np.unique(kappa, axis=0)) < _TOLD_APART:
+        return False
+    try:
+        pairs = [(m.A.T, (m.C / y_scale[:, None]).T) for m in models]
+        factors = np.array([gramian_factor(*pair, False).T for pair in pairs])
+    except ValueError:
+        return False
+
+    def error(terms: Array) -> float:
+        """Of points left out, of a linear form in `terms` (n_points, n_terms)."""
+        left = np.eye(len(terms)) - terms @ np.linalg.pinv(terms)
+        alone = np.diag(left)[:, None]
+        if alone.min() < _ROUNDING:  # the others do not tell the form
+            return np.inf
+        return float(np.sum(_times(factors, left @ states / alone) ** 2))
+
+    one = np.ones((len(kappa), 1))
+    plain = [kappa - kappa.mean(axis=0)]
+    if (kappa > _POSITIVE).all():
+        plain += [np.log(kappa), 1.0 / kappa]
+    curves = [np.hstack([one, x]) for x in plain]
+    curves.append(np.hstack([one, plain[0], plain[0] ** 2]))
+    return min(map(error, curves)) > _BETTER * error(one)
 
 
 def _measure_all_states(
@@ -237,12 +303,14 @@ def interpolated(
     values: Array,
     model_at: Callable[[Array], StateSpace],
     scales: tuple[Array, Array],
+    *,
+    tell: bool = False,
 ) -> Any:
     """The `values` of points of work over `kappa`: as they are, or by their models.
 
     As the regressors that `spline` makes; `model_at` gives the frozen model at
     scheduling values (n_scheduling,), `scales` are the sizes of the motions of inputs
-    and outputs.
+    and outputs. Points that the best way misses without them are told, if asked to.
     """
     by_themselves = spline().fit(kappa, values)
     if kappa.shape[1] > 1:
@@ -268,11 +336,18 @@ def interpolated(
     if (kappa > _POSITIVE).all():
         # what stays in a flow is held for as long as one over it
         ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, np.reciprocal)]
+    over = _straight_inputs(spline, kappa, u)
+    if any(pair is not _ITSELF for pair in over):
+        ways.append((partial(_by_straight_inputs, over, spline), _BETTER))
     best, least = ways[0][0], np.inf
-    for way, share in ways if len(ways) > 1 else ():
-        error = _error_at_rest(way, points, scales[1])
+    of_best: dict[int, Array] = {}
+    for way, share in ways if tell or len(ways) > 1 else ():
+        missed = _missed_at_rest(way, points, scales[1])
+        error = float(np.mean(np.square([*missed.values()]))) if missed else 0.0
         if least > _BENT and error < share * least:
-            best, least = way, error
+            best, least, of_best = way, error, missed
+    if tell and of_best:
+        _tell_missed(of_best, points, scales)
     if best is ways[0][0]:
         return by_themselves
     found = best(points)
@@ -313,17 +388,51 @@ class _Points(NamedTuple):
         return _are_one(self.constants_of_sensors(), self.equilibria()[1], y_scale)
 
 
-def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:
-    """Mean squared error of outputs at rest at points left out; 0 without any."""
-    errors = []
+def _missed_at_rest(way: _Way, points: _Points, y_scale: Array) -> dict[int, Array]:
+    """By points between others, the errors (n_outputs,) of outputs at rest without it.
+
+    In motions. An equilibrium with other inputs is as good, up to what is not known of
+    the gain.
+    """
+    errors = {}
     for out in inner_places(points.kappa):
         k = int(out.argmax())
         model = points.models[k]
         known = _Work.of(model, points.values[k])
         there = way(points.kept(np.flatnonzero(~out)))(points.kappa[k], model)
-        moved = there.y + model.dc_gain() @ (known.u - there.u)
-        errors.append((moved - known.y) / y_scale)
-    return float(np.mean(np.square(errors))) if errors else 0.0
+        gain, change = model.dc_gain(), known.u - there.u
+        error = there.y + gain @ change - known.y
+        unknown = _GAIN**2 * gain**2 @ change**2
+        errors[k] = np.sqrt(error**2 + unknown) / y_scale
+    return errors
+
+
+def _tell_missed(
+    missed: dict[int, Array], points: _Points, scales: tuple[Array, Array]
+) -> None:
+    """Tell of the point whose output at rest is missed most.
+
+    By what experiments move it, or would, if it settled: that may be far more.
+    """
+    u_scale, y_scale = scales
+    off = {k: error * y_scale for k, error in missed.items()}
+    moves = {
+        k: np.hypot(y_scale, np.linalg.norm(gain * u_scale, axis=1))
+        for k in missed
+        for gain in [points.models[k].dc_gain()]
+    }
+    k = max(missed, key=lambda k: float(np.max(off[k] / moves[k])))
+    i = int(np.argmax(off[k] / moves[k]))
+    if off[k][i] > _MISSED * moves[k][i]:
+        names = points.models[k].output_names or range(len(y_scale))
+        warn(
+            "equilibria between the operating points are a guess: without point "
+            f"{k} (scheduling {points.kappa[k, 0]:.4g}) the others miss output "
+            f"{names[i]!r} at rest by {off[k][i]:.3g}, where the motion of the "
+            f"experiments is worth {moves[k][i]:.3g}. Measure in between "
+            "(`suggest_operating_point`), or give a scheduling variable over which "
+            "inputs and outputs at rest are smoother."
+        )
 
 
 def _by_one_constant(spline: Callable[[], Any], points: _Points) -> _AtRest:
@@ -338,8 +447,14 @@ def _by_one_constant(spline: Callable[[], Any], points: _Points) -> _AtRest:
     return at_rest
 
 
-def _itself(kappa: Array) -> Array:
-    return kappa
+def _itself(values: Array) -> Array:
+    return values
+
+
+# Functions of what is positive, and from them to it: what saturates grows as one over
+# what is left, what doubles from point to point is a power
+_ITSELF: _Pair = _itself, _itself
+_STRAIGHTER: tuple[_Pair, ...] = (np.log, np.exp), (np.reciprocal, np.reciprocal)
 
 
 def _over(
@@ -350,6 +465,57 @@ def _over(
 
     def at_rest(place: Array, model: StateSpace) -> _Work:
         return _Work.of(model, curve.predict([function(place)])[0])
+
+    return at_rest
+
+
+def _straight_inputs(spline: Callable[[], Any], kappa: Array, u: Array) -> list[_Pair]:
+    """Of every input, over what function its levels are foreseen best, if clearly."""
+
+    def error(pair: _Pair, level: Array) -> float:
+        function, back = pair
+        errors = []
+        for out in inner_places(kappa):
+            curve = _within(spline, kappa[~out], function(level[~out]))
+            errors.append(back(curve(kappa[out])) - level[out])
+        return float(np.sum(np.square(np.concatenate(errors)))) if errors else 0.0
+
+    found: list[_Pair] = []
+    for level in u.T[..., None]:
+        pair = _ITSELF
+        if (level > _POSITIVE).all():
+            errors = [error(other, level) for other in _STRAIGHTER]
+            if min(errors) < _BETTER * error(pair, level):
+                pair = _STRAIGHTER[int(np.argmin(errors))]
+        found.append(pair)
+    return found
+
+
+def _within(
+    spline: Callable[[], Any], kappa: Array, values: Array
+) -> Callable[[Array], Array]:
+    """A curve that stays in the range of its points: an inverse must not cross zero."""
+    curve, ends = spline().fit(kappa, values), (values.min(axis=0), values.max(axis=0))
+    return lambda places: np.clip(curve.predict(places), *ends)
+
+
+def _by_straight_inputs(
+    pairs: Sequence[_Pair], spline: Callable[[], Any], points: _Points
+) -> _AtRest:
+    """Curves through inputs over functions of theirs, and through the rest as it is."""
+    curve = spline().fit(points.kappa, points.values)
+    levels = zip(points.equilibria()[0].T[..., None], pairs, strict=True)
+    inputs = [
+        (k, back, _within(spline, points.kappa, function(level)))
+        for k, (level, (function, back)) in enumerate(levels)
+        if function is not _itself
+    ]
+
+    def at_rest(place: Array, model: StateSpace) -> _Work:
+        values = curve.predict([place])[0]
+        for k, back, level in inputs:
+            values[k] = back(level(place[None]))[0, 0]
+        return _Work.of(model, values)
 
     return at_rest
 

@@ -620,7 +620,9 @@ list, default=None
                 output_names=self.output_names_,
                 units=self.units,
             )
-            self.lpv_ = replace(self.lpv_, offsets=self._fit_offsets(models))
+            self.lpv_ = replace(
+                self.lpv_, offsets=self._fit_offsets(models, not moving)
+            )
             frozen = self.lpv_.silenced().at(kappa[0])
             names = frozen.input_names, frozen.output_names, frozen.units
             self.local_models_ = [m.lti.with_names(*names) for m in found.local]
@@ -839,7 +841,7 @@ list, default=None
             return PolynomialLPV(degree=0)
         return AutoLPV() if self.interpolator is None else clone(self.interpolator)
 
-    def _fit_offsets(self, found: StructuredModels) -> Any:
+    def _fit_offsets(self, found: StructuredModels, tell: bool) -> Any:
         """Interpolation of inputs, outputs and states at rest; None for none."""
         known = offsets_of_points(found) if self.offsets == "auto" else None
         if known is None:
@@ -849,7 +851,8 @@ list, default=None
         spline = partial(SplineLPV, "cubic", extrapolation=beyond)
         values, scales = known
         frozen = self.lpv_.silenced().at
-        return interpolated(spline, found.points.kappa, values, frozen, scales)
+        kappa = found.points.kappa
+        return interpolated(spline, kappa, values, frozen, scales, tell=tell)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))

@@ -345,3 +345,102 @@ def test_one_constant_of_the_sensors_is_no_family(seed):
     x = np.hstack([gain[:, None] * u, 0.5 * gain[:, None] * u])
     found = points_of_work(models, kappa, u, 2.0 * x[:, 1:] + 5.0, ONE)
     np.testing.assert_allclose(np.diff(found[:, 2:], axis=0), np.diff(x, axis=0))
+
+
+def mixed(flow, rng, part=0.01):
+    """A stream that is dosed, and a sensor whose slope is known to a part."""
+    slope, rate = 2.0 * (1.0 + part * rng.standard_normal()), 0.1
+    return StateSpace([[-flow, 0], [slope * rate, -rate]], [[1.0], [0]], [[0, 1.0]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_held_at_a_set_point_has_one_state_at_rest(seed):
+    """Inputs of hundreds of motions, times what is not known of the models."""
+    rng = np.random.default_rng(seed)
+    flow = np.linspace(1.0, 2.2, 5)[:, None]
+    models = [mixed(f, rng) for f in flow[:, 0]]
+    u0, y0 = 100.0 * flow, 6.0 + 0.05 * rng.standard_normal(flow.shape)
+    found = points_of_work(models, flow, u0, y0, ONE)
+    assert_allclose(found[:, :2], np.hstack([u0, y0]))
+    # the states of the sensor follow its outputs, those before it by its slope
+    assert_allclose(np.diff(found[:, 3]), np.diff(y0[:, 0]), atol=1e-9)
+    assert_allclose(found[:, 2], found[:, 2].mean(), atol=0.1)
+
+
+def test_a_basis_that_turns_moves_no_state_that_is_held():
+    """Black boxes: what a turn makes of a state far from zero is none of its motion."""
+    rng = np.random.default_rng(0)
+    flow = np.linspace(1.0, 2.2, 5)[:, None]
+    turns = [np.array([[1.0, 0.1 * f], [-0.1 * f, 1.0]]) for f in flow[:, 0]]
+    models = [
+        mixed(f, rng).transform(T) for f, T in zip(flow[:, 0], turns, strict=True)
+    ]
+    work = models, flow, 100.0 * flow, np.full_like(flow, 6.0), ONE
+    assert_allclose(np.ptp(points_of_work(*work, structured=False)[:, 2:], axis=0), 0.0)
+    assert np.ptp(points_of_work(*work)[:, 2:], axis=0).min() > 1.0
+
+
+@pytest.mark.parametrize("n_points", [3, 5])
+def test_a_state_that_moves_while_the_output_is_held_moves_at_rest(n_points):
+    """A heater in a stream that it keeps at one temperature: hotter with more."""
+    rng = np.random.default_rng(0)
+    flow = np.linspace(1.0, 2.2, n_points)[:, None]
+    models = [
+        StateSpace([[-h, h], [h, -h - f]], [[1.0], [0.0]], [[0.0, 1.0]])
+        for f in flow[:, 0]
+        for h in [5.0 * (1.0 + 0.01 * rng.standard_normal())]
+    ]
+    u0, y0 = 35.0 * flow, np.full_like(flow, 50.0)
+    found = points_of_work(models, flow, u0, y0, ONE)
+    assert_allclose(np.diff(found[:, 2]), np.diff(u0[:, 0]) / 5.0, atol=0.35)
+    assert_allclose(np.ptp(found[:, 3]), 0.0, atol=1e-9)
+
+
+FEED = np.linspace(8.0, 12.0, 5)[:, None]
+
+
+def condenser(feed):
+    """A pressure, and cooling that hardly acts where its valve is nearly open."""
+    return StateSpace(-1.0, -5.0 * saturating(feed) ** -2, 1.0)
+
+
+def saturating(feed):
+    """A flow, from 2 to 40, of which one over it is linear."""
+    return 1.0 / (0.5 - 0.475 * (np.ravel(feed)[0] - 8.0) / 4.0)
+
+
+def test_inputs_that_saturate_are_followed_over_one_over_them():
+    """And outputs that stand where they are do so between the points."""
+    u0 = np.array([[saturating(f)] for f in FEED])
+    y0 = np.full_like(u0, 25.0)
+    scales = np.array([0.3]), np.array([0.2])
+    values = np.hstack([u0, y0, y0])
+
+    def spline():
+        return SplineLPV("cubic")
+
+    found = interpolated(spline, FEED, values, condenser, scales, tell=True)
+    between = 0.5 * (FEED[1:] + FEED[:-1])
+    u, y, x = found.predict(between).T
+    assert_allclose(u, [saturating(f) for f in between], rtol=1e-6)
+    assert_allclose([y, x], 25.0, rtol=1e-9)
+    alone = spline().fit(FEED, values).predict(between)[:, 0]
+    assert np.abs(alone / u - 1.0).max() > 0.1
+
+
+def test_points_that_no_curve_foresees_are_told():
+    """A valve that sticks at one of the points."""
+    values = np.hstack([FEED, 25.0 + 0.0 * FEED, 25.0 + 0.0 * FEED])
+    scales = np.array([0.3]), np.array([0.2])
+
+    def first_order(feed):
+        return StateSpace(-1.0, 1.0, 1.0)
+
+    def spline():
+        return SplineLPV("cubic")
+
+    smooth = interpolated(spline, FEED, values, first_order, scales, tell=True)
+    assert_allclose(smooth.predict(FEED + 0.5)[:4, 0], FEED[:4, 0] + 0.5)
+    values[2, 0] += 30.0
+    with pytest.warns(UserWarning, match="miss output 0 at rest by .* Measure in"):
+        interpolated(spline, FEED, values, first_order, scales, tell=True)

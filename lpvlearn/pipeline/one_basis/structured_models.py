@@ -400,7 +400,8 @@ def offsets_of_points(
     inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
     scales = (u_scale, y_scale)
     kappa = found.points.kappa
-    return points_of_work(found.models, kappa, inputs, outputs, scales), scales
+    known = found.models, kappa, inputs, outputs, scales
+    return points_of_work(*known, structured=bool(found.restructurers)), scales
 
 
 def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> bool:
