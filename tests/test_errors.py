@@ -361,6 +361,10 @@ TABLES |= {
         lambda: fit("data.csv"),
         ["`X` must be a table (a pandas.DataFrame)", "'data.csv'"],
     ),
+    "a name for the outputs": (
+        lambda: fit(y="position"),
+        ["`y` must be a table (a pandas.DataFrame)", "'position'"],
+    ),
     "nothing for the table": (lambda: fit(None), ["`X` must be a table", "None"]),
     "a set for the table": (lambda: fit({1, 2}), ["`X` must be a table", "set"]),
     "dates for the inputs": (

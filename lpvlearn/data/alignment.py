@@ -27,7 +27,7 @@ def align_outputs(
     >>> align_outputs(X, y) is y
     True
     """
-    if y is None or not hasattr(y, "__len__"):
+    if y is None or isinstance(y, str) or not hasattr(y, "__len__"):
         return y  # where outputs are read, it is said what they must be
     y = in_columns(y, getattr(estimator, "_output_names", None))
     first, second = names  # in messages
