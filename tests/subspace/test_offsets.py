@@ -144,7 +144,6 @@ def test_a_given_order_does_not_hide_a_drift(rng, size):
     assert error_of(given) < 0.05
 
 
-@pytest.mark.filterwarnings("ignore:Output . drifts along a line")
 def test_what_constants_gain_beside_a_given_order_is_no_drift(rng, monkeypatch):
     """Where constants were not suspected, and drifts are."""
     u = np.repeat(rng.standard_normal((40, 1)), 10, axis=0)
@@ -157,6 +156,7 @@ def test_what_constants_gain_beside_a_given_order_is_no_drift(rng, monkeypatch):
     assert not model.output_drift_.any()
 
 
+@pytest.mark.filterwarnings("ignore:Output . drifts along a line")
 @pytest.mark.parametrize("order", ["auto", 3])
 def test_a_drift_is_no_integrator_that_the_level_of_an_input_moves(rng, order):
     X, y = table(rng, levels=(5.0,), n=600, noise=0.1, drift=3.0, u0=4.0)
