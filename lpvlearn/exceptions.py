@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
-_HERE = str(Path(__file__).parent) + os.sep
+LIBRARY = Path(__file__).parent  # the folder of all that is ours
+_HERE = str(LIBRARY) + os.sep
 
 
 class ExtrapolationWarning(UserWarning):

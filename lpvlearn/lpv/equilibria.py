@@ -415,23 +415,22 @@ def _tell_missed(
     By what experiments move it, or would, if it settled: that may be far more.
     """
     u_scale, y_scale = scales
-    off = {k: error * y_scale for k, error in missed.items()}
-    moves = {
-        k: np.hypot(y_scale, np.linalg.norm(gain * u_scale, axis=1))
-        for k in missed
-        for gain in [points.models[k].dc_gain()]
+    settled = {
+        k: points.models[k].dc_gain() * u_scale / y_scale[:, None] for k in missed
     }
-    k = max(missed, key=lambda k: float(np.max(off[k] / moves[k])))
-    i = int(np.argmax(off[k] / moves[k]))
-    if off[k][i] > _MISSED * moves[k][i]:
+    worth = {k: np.hypot(1.0, np.linalg.norm(settled[k], axis=1)) for k in missed}
+    shares = {k: missed[k] / worth[k] for k in missed}
+    k = max(shares, key=lambda k: float(shares[k].max()))
+    i = int(shares[k].argmax())
+    if shares[k][i] > _MISSED:
         names = points.models[k].output_names or range(len(y_scale))
         warn(
             "equilibria between the operating points are a guess: without point "
             f"{k} (scheduling {points.kappa[k, 0]:.4g}) the others miss output "
-            f"{names[i]!r} at rest by {off[k][i]:.3g}, where the motion of the "
-            f"experiments is worth {moves[k][i]:.3g}. Measure in between "
-            "(`suggest_operating_point`), or give a scheduling variable over which "
-            "inputs and outputs at rest are smoother."
+            f"{names[i]!r} at rest by {missed[k][i] * y_scale[i]:.3g}, where the "
+            f"motion of the experiments is worth {worth[k][i] * y_scale[i]:.3g}. "
+            "Measure in between (`suggest_operating_point`), or give a scheduling "
+            "variable over which inputs and outputs at rest are smoother."
         )
 
 

@@ -881,9 +881,11 @@ class GrayBoxStructure(VersionedPickle):
         return StateSpace(*self.matrices(self.check_params(theta)), sampling_time)
 
 
-def drawn_around(guess: Array, n: int, rng: np.random.Generator) -> Array:
+def drawn_around(
+    guess: Array, n: int, rng: np.random.Generator, spread: float = _SPREAD
+) -> Array:
     """Random vectors around a guess that keep its signs, shape (n, n_params)."""
-    return guess * np.exp(_SPREAD * rng.normal(size=(n, len(guess))))
+    return guess * np.exp(spread * rng.normal(size=(n, len(guess))))
 
 
 def _number(value: Any) -> float:

@@ -15,7 +15,7 @@ ones of every length kept; their evidences also tell how certain the choice is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from scipy.spatial.distance import cdist
 from ...lpv.alignment import spanning_tree
 from ...models.scheduling_range import in_range_of_points
 from ...restructuring.problem import RestructuringProblem
+from ...restructuring.uncertainty import ParameterUncertainty
 from ...structures.interchanges import (
     distance,
     interchanges,
@@ -34,7 +35,7 @@ from ...structures.interchanges import (
     slow_first,
     within_bounds,
 )
-from ...structures.structure import GrayBoxStructure
+from ...structures.structure import GrayBoxStructure, drawn_around
 
 Array = NDArray[np.float64]
 Choices = NDArray[np.intp]
@@ -157,17 +158,12 @@ def _variances(
     own = np.where(np.isnan(np.diag(known)), 0.0, np.diag(known))
     found = [own] * len(optima)
     if len(optima) > 1 and np.isfinite(known).all():
-        first, *others = (_derivatives(problem, theta) for theta in optima)
-        changes = [np.linalg.lstsq(J, first)[0] for J in others]
-        found[1:] = [np.maximum(np.diag(M @ known @ M.T), 0.0) for M in changes]
+        dG = problem.system.response_jacobian(optima[0], problem.omega)[1]
+        dG = np.moveaxis(dG, -1, 0)
+        for k, theta in enumerate(optima[1:], start=1):
+            T = ParameterUncertainty(problem, theta).changes(dG, "hinf")
+            found[k] = np.maximum(np.diag(T.T @ known @ T), 0.0)
     return np.array(found)
-
-
-def _derivatives(problem: RestructuringProblem, theta: Array) -> Array:
-    """Of the response by the parameters, real and imaginary parts."""
-    J = problem.system.response_jacobian(theta, problem.omega)[1]
-    J = J.reshape(-1, J.shape[-1])
-    return np.vstack([J.real, J.imag])
 
 
 def _equal_optima(
@@ -236,16 +232,14 @@ def _exchanges(
     Of parts of like kind, lags in series, say, another value of each gives the same
     response. Of many parameters that is not looked for.
     """
-    n, found = len(theta), theta[None]
-    kept: list[list[int]] = []
-    for i, j in combinations(range(n if n <= _FEW else 0), 2):
-        pi = [{i: j, j: i}.get(k, k) for k in range(n)]
-        fit = problem.fit(theta[pi])
-        equal = fit is not None and fit.relative_error <= most
-        if fit is not None and equal and _is_other(fit.x, found):
-            found = np.vstack([found, fit.x])
-            kept.append(pi)
-    return kept
+    n = len(theta)
+    exchanged = [
+        [{i: j, j: i}.get(k, k) for k in range(n)]
+        for i, j in combinations(range(n if n <= _FEW else 0), 2)
+    ]
+    itself = np.arange(n)[None]
+    starts = [theta[pi] for pi in exchanged]
+    return [exchanged[k] for k, _ in _others(problem, theta, starts, most, itself)]
 
 
 def _elsewhere(
@@ -255,16 +249,31 @@ def _elsewhere(
 
     As where a lag may have any of several poles, and the rest of a model follows.
     """
-    rng, found = np.random.default_rng(0), [theta]
-    lower, upper = problem.structure.lower, problem.structure.upper
-    for _ in range(_SCATTERED):
-        start = theta * np.exp(_SPREAD * rng.standard_normal(len(theta)))
-        fit = problem.fit(np.clip(start, lower, upper))
+    starts = drawn_around(theta, _SCATTERED, np.random.default_rng(0), _SPREAD)
+    starts = np.clip(starts, problem.structure.lower, problem.structure.upper)
+    return [other for _, other in _others(problem, theta, starts, most, places)]
+
+
+def _others(
+    problem: RestructuringProblem,
+    theta: Array,
+    starts: Iterable[Array],
+    most: float,
+    places: Choices,
+) -> list[tuple[int, Array]]:
+    """Numbers of the starts that lead to other optima of at most that error, and these.
+
+    Other than theta and than one another, apart from permutations `places`.
+    """
+    known, found = theta[places], []
+    for k, start in enumerate(starts):
+        fit = problem.fit(start)
         if fit is None or fit.relative_error > most:
             continue
-        if _is_other(fit.x, np.vstack([one[places] for one in found])):
-            found.append(fit.x)
-    return found[1:]
+        if _is_other(fit.x, known):
+            known = np.vstack([known, fit.x[places]])
+            found.append((k, fit.x))
+    return found
 
 
 def _numbering(

@@ -27,10 +27,8 @@ import scipy
 from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
-from ...exceptions import warn
+from ...exceptions import LIBRARY, warn
 from ...validation import shown
-
-_LIBRARY = Path(__file__).parents[2]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_FOLDER = (errno.ENOENT, errno.ENOTDIR)
@@ -166,7 +164,7 @@ def fingerprint(value: Any) -> str:
 def _library() -> bytes:
     """This library's code, and the versions of what it computes with."""
     digest = hashlib.blake2b(f"{np.__version__} {scipy.__version__}".encode())
-    for file in sorted(_LIBRARY.rglob("*.py")):
+    for file in sorted(LIBRARY.rglob("*.py")):
         digest.update(file.read_bytes())
     return digest.digest()
 
@@ -286,7 +284,7 @@ def _source_of(module: ModuleType) -> str:
 def _installed_version(module: str) -> str | None:
     """Version of the package of a module, "" if unknown; None for a user's own."""
     top = module.split(".")[0]
-    if top in sys.stdlib_module_names or top == _LIBRARY.name:
+    if top in sys.stdlib_module_names or top == LIBRARY.name:
         return ""
     package = sys.modules.get(top)
     file = getattr(package, "__file__", None)
