@@ -35,7 +35,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, companion, eig, matrix_balance, null_space, qr
+from scipy.linalg import (
+    block_diag,
+    companion,
+    eig,
+    matrix_balance,
+    null_space,
+    qr,
+    schur,
+    solve_continuous_lyapunov,
+    solve_sylvester,
+)
 
 from ..structures.map import framed
 from ..structures.structure import GrayBoxStructure
@@ -69,16 +79,12 @@ class _Step(NamedTuple):
     pole: complex
     instead: complex
     shown: Flags
+    n_directions: int  # that it hides
 
     @property
     def near(self) -> float:
         """Distance up to which a pole is an estimate of this one."""
         return _NEAR * abs(self.instead - self.pole)
-
-    def distances(self, poles: Complex) -> Array:
-        """Of poles that may be estimates of this one: real ones, or upper ones."""
-        alike = np.sign(poles.imag) == np.sign(self.pole.imag)
-        return np.where(alike, np.abs(poles - self.pole), np.inf)
 
 
 @dataclass(frozen=True)
@@ -123,24 +129,34 @@ class Division:
     def lacks(self, model: Target) -> bool:
         """Whether a model has not all of the poles, nor estimates of them."""
         own = np.linalg.eigvals(model.A).astype(complex)
-        for step in self.steps:
-            found = np.sum(step.distances(own) <= step.near)
-            if found < sum(other.pole == step.pole for other in self.steps):
-                return True
-        return False
+        return any(
+            np.sum(_distances(own, chain) <= chain[0].near) < len(chain)
+            for chain in self._chains()
+        )
+
+    def _chains(self) -> list[list[_Step]]:
+        """The steps of every pole."""
+        poles = dict.fromkeys(step.pole for step in self.steps)
+        return [[step for step in self.steps if step.pole == p] for p in poles]
 
     def of(self, model: Target) -> Target:
         """The weights behind a model, without those of its poles that they cancel."""
-        for step in self.steps:
-            model = _snapped(model, step)
-            A = model.A
-            V = _directions(A, step.pole, _SHARED, step.near)
-            hidden = np.abs(model.C[~step.shown] @ V).max(0, initial=0.0)
-            size = np.abs(model.C).max(initial=0.0)
-            V = V[:, hidden <= _SHARED * size]
-            left, right, constant = _frame(step, model.C @ V, V, model.B.shape[1])
-            S = left @ model.system_matrix @ right + constant
-            model = Target.of(S, left.shape[0] - len(model.C), model.dt)
+        for chain in self._chains():
+            chained = _chained(model, chain)
+            model = chained or model
+            for step in chain:
+                if chained is None:
+                    model = _snapped(model, step)
+                    V = _directions(model.A, step.pole, _SHARED, step.near)
+                else:  # in states of even size
+                    own = model.A - step.pole.real * np.eye(len(model.A))
+                    V = np.linalg.svd(own)[2][-step.n_directions :].T
+                hidden = np.abs(model.C[~step.shown] @ V).max(0, initial=0.0)
+                size = np.abs(model.C).max(initial=0.0)
+                V = V[:, hidden <= _SHARED * size]
+                left, right, constant = _frame(step, model.C @ V, V, model.B.shape[1])
+                S = left @ model.system_matrix @ right + constant
+                model = Target.of(S, left.shape[0] - len(model.C), model.dt)
         return model
 
 
@@ -197,7 +213,7 @@ def divide(
                         "the entries of C are numbers, and put the gain into B."
                     )
             shown = np.abs(CV).max(1) > _FIXED * np.abs(CV).max()
-            step = _Step(pole, instead, np.asarray(shown))
+            step = _Step(pole, instead, np.asarray(shown), V.shape[1])
             frame = _frame(step, CV, V, structure.n_inputs)
             order = frame[0].shape[0] - structure.n_outputs
             structure = structure.with_map(order, framed(structure.map, *frame))
@@ -312,7 +328,7 @@ def _snapped(model: Target, step: _Step) -> Target:
     if len(A) == 0:
         return model
     poles, W, V = eig(A, left=True)
-    away = step.distances(poles)
+    away = _distances(poles, [step])
     i = int(np.argmin(away))
     v, w = V[:, i], W[:, i].conj()
     if not away[i] <= step.near or abs(w @ v) <= _CHAINED:
@@ -321,12 +337,97 @@ def _snapped(model: Target, step: _Step) -> Target:
     count = len(_both(step.pole))
     if _directions(A, step.pole, _SHARED, step.near).shape[1] == 0:
         A = A + count * ((step.pole - poles[i]) * mode).real
-    hidden, c = ~step.shown, step.near / _NEAR
+    moved = Target(A, B, C, model.D, model.dt)
+    return _without_part(moved, ~step.shown, C @ mode, step)
+
+
+def _without_part(
+    model: Target, hidden: Flags, part: Array | Complex, step: _Step
+) -> Target:
+    """A model whose `hidden` outputs do not show a part of C, where that is little."""
+    A, B, C = model.A, model.B, model.C
+    c = step.near / _NEAR
     G = np.linalg.solve((step.pole + 1j * c) * np.eye(len(A)) - A, B)
-    part = np.linalg.norm(C[hidden] @ mode @ B) / c
-    if part <= _NEAR * np.linalg.norm(C[hidden] @ G + model.D[hidden]):
-        C = np.where(hidden[:, None], C - count * (C @ mode).real, C)
+    size = np.linalg.norm(C[hidden] @ G + model.D[hidden])
+    if np.linalg.norm(part[hidden] @ B) / c <= _NEAR * size:
+        C = np.where(hidden[:, None], C - len(_both(step.pole)) * part.real, C)
     return Target(A, B, C, model.D, model.dt)
+
+
+def _chained(model: Target, chain: Sequence[_Step]) -> Target | None:
+    """A model with its poles near a real one moved there, into chains as the steps'.
+
+    In states that are theirs, balanced for what changes at the rate c, and the others.
+    Of outputs that do not show a part of it that is left out, as in `_snapped`. None
+    where the poles are no chain, or not as many as the steps divide out.
+    """
+    A, B, C = model.A, model.B, model.C
+    count, pole, near = sum(s.n_directions for s in chain), chain[0].pole, chain[0].near
+    away = np.sort(_distances(np.linalg.eigvals(A).astype(complex), chain))
+    if len(chain) == 1 or pole.imag or not (away <= near).sum() == count:
+        return None
+    p, c = pole.real, near / _NEAR
+    R, Z, k = schur(A, sort=lambda re, im=0.0: np.hypot(re - p, im) <= near)
+    if k != count:  # one at the border
+        return None
+    own, others = R[:k, :k] - p * np.eye(k), R[k:, k:]
+    beside = np.zeros((k, len(others)))
+    if len(others):
+        beside = solve_sylvester(R[:k, :k], -others, -R[:k, k:])
+    Bs, Cs = Z.T @ B, C @ Z
+    B, C = Bs[:k] - beside @ Bs[k:], Cs[:, :k]
+    T = _balancing(own - c * np.eye(k), B, C)
+    own = np.linalg.solve(T, own @ T)
+    Q, number = _staircase(own, [step.n_directions for step in chain])
+    later = number[:, None] < number
+    A = block_diag(p * np.eye(k) + np.where(later, Q.T @ own @ Q, 0.0), others)
+    B = np.vstack([Q.T @ np.linalg.solve(T, B), Bs[k:]])
+    C = np.hstack([C @ T @ Q, Cs[:, :k] @ beside + Cs[:, k:]])
+    model = Target(A, B, C, model.D, model.dt)
+    shown = np.zeros(len(C), dtype=bool)
+    for place, step in enumerate(chain):
+        shown |= step.shown
+        states = np.zeros(len(A), dtype=bool)
+        states[:k] = number == place
+        model = _without_part(model, ~shown, np.where(states, C, 0.0), step)
+    return model
+
+
+def _distances(poles: Complex, chain: Sequence[_Step]) -> Array:
+    """Of poles that may be estimates of that of the steps.
+
+    Real ones, or upper ones; of several at one place any.
+    """
+    pole = chain[0].pole
+    alike = np.sign(poles.imag) == np.sign(pole.imag)
+    if len(chain) > 1 and not pole.imag:
+        alike = np.ones(len(poles), dtype=bool)
+    return np.where(alike, np.abs(poles - pole), np.inf)
+
+
+def _balancing(A: Array, B: Array, C: Array) -> Array:
+    """States in which the inputs move a stable model as much as outputs show."""
+    reached = solve_continuous_lyapunov(A, -B @ B.T)
+    seen = solve_continuous_lyapunov(A.T, -C.T @ C)
+    some = _CLEAN * np.eye(len(A))
+    L = np.linalg.cholesky(reached + np.trace(reached) * some)
+    squares, U = np.linalg.eigh(L.T @ (seen + np.trace(seen) * some) @ L)
+    return np.asarray(L @ U * squares**-0.25)
+
+
+def _staircase(N: Array, counts: Sequence[int]) -> tuple[Array, NDArray[np.intp]]:
+    """What a matrix hardly moves, what it hardly moves beyond that, and so on.
+
+    An orthonormal basis, and the number of each direction in `counts`, which says how
+    many there are.
+    """
+    bases, rest = [], np.eye(len(N))
+    for count in counts:
+        V = np.linalg.svd(rest.T @ N @ rest)[2].T
+        first = V.shape[1] - count
+        bases.append(rest @ V[:, first:])
+        rest = rest @ V[:, :first]
+    return np.hstack(bases), np.repeat(np.arange(len(counts)), counts)
 
 
 def _blocks(structure: GrayBoxStructure, theta: Array) -> tuple[Array, Array]:

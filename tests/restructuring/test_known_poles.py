@@ -311,6 +311,52 @@ def test_a_black_box_that_lacks_the_integrator_is_told_of():
         GrayBoxRestructurer(structure).fit_model(box)
 
 
+# Positions along two axes and one velocity; a lag drives one of them.
+AXES = template(
+    [
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 1],
+        [0, 0, 0, 1, 0],
+        [0, 0, 0, 0, 0],
+        [0, 0, 0, 0, "-a"],
+    ],
+    [[0, 0], [0, "f"], [0, 0], [0, "g"], ["b", 0]],
+    [[1, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 1, 0, 0, 0]],
+)
+EYE = np.eye(5)
+
+
+@pytest.mark.parametrize(
+    ("structure", "values", "positions", "centres"),
+    [
+        (*CASES["double integrator"][:2], [[1, 1, 0, 0]], [[1 / 3, 2 / 3, 0, 0]]),
+        (AXES, {"a": 3.0, "b": 2.0, "f": 0.5, "g": 4.0}, EYE[[0, 2]], EYE[[0, 2]]),
+    ],
+)
+@pytest.mark.parametrize(
+    ("total", "product"),
+    [(0.0, -1e-8), (0.0, 1e-8), (3e-3, 2e-6), (-2e-3, 2e-6), (0.0, 0.0)],
+)
+def test_poles_about_a_double_integrator_are_estimates_of_it(
+    structure, values, positions, centres, total, product
+):
+    """With s^2 - total s + product for s^2, in a basis where no entry tells of it."""
+    truth = structure.model(values)
+    at, seen = np.asarray(positions, float), np.asarray(centres, float)
+    step = 2 if len(at) == 1 else 1  # from the state of a position to its velocity
+    moving, seen_moving = (np.roll(of, step, axis=1) for of in (at, seen))
+    change = moving.T @ (total * seen_moving - product * seen)
+    model = StateSpace(truth.A + change, truth.B, truth.C)
+    slow = np.sort(np.abs(model.poles() ** 2 - total * model.poles() + product))
+    np.testing.assert_allclose(slow[: 2 * len(at)], 0.0, atol=1e-10)
+    fitted = GrayBoxRestructurer(structure).fit_model(
+        disguised(model, np.random.default_rng(2))
+    )
+    np.testing.assert_allclose(
+        fitted.params_, structure.check_params(values), rtol=5e-3
+    )
+
+
 @pytest.mark.parametrize("shift", [-0.01, 0.01, 0.01j, -0.01j])
 def test_a_pair_that_is_nearly_the_known_one_is_an_estimate_of_it(shift):
     truth = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
