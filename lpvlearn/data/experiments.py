@@ -241,6 +241,15 @@ def _by_channel(values: Array, rows: Indices) -> Array:
     return np.take(values.T, rows, axis=1).T
 
 
+def are_beginnings(experiments: Sequence[Experiment]) -> list[bool]:
+    """Which of them are no part of an experiment that comes after a gap.
+
+    Parts have the label of their experiment, and are in the order of time.
+    """
+    labels = [e.label for e in experiments]
+    return [labels.index(label) == k for k, label in enumerate(labels)]
+
+
 def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
     """Inputs with a last column that tells the experiments apart, and outputs."""
     u = np.vstack([e.inputs for e in experiments])

@@ -456,6 +456,20 @@ def test_step_tests_begin_where_they_stood(level, delay):
     np.testing.assert_allclose(known, model.predict(u), atol=0.1)
 
 
+def test_runs_after_a_gap_are_no_beginnings():
+    """A run that begins in motion may do so where inputs were held for a while."""
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (300, 1)).repeat(10, axis=0)
+    truth = StateSpace([[0.0, 8.0], [-8.0, -2.4]], [[0.0], [24.0]], [[1.0, 0.0]])
+    y = truth.simulate(u, sampling_time=0.02)
+    y += 0.03 * y.std() * rng.standard_normal(y.shape)
+    y[rng.choice(3000, 8, replace=False)] = np.nan
+    model = SubspaceLTI(2, sampling_time=0.02, missing="split").fit(u, y)
+    assert len(model.initial_states_) > 8 and not model.steady_start_
+    fresh = rng.choice([-1.0, 1.0], (100, 1)).repeat(10, axis=0)
+    assert model.score(fresh, truth.simulate(fresh, sampling_time=0.02)) > 0.99
+
+
 def test_records_that_begin_at_rest_go_on_doing_so():
     """With inputs that are held for long, too, and without a level."""
     rng = np.random.default_rng(0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import compress
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from ...data.experiments import are_beginnings
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, retold, take_back, warn
 from ...lpv.auto import AutoLPV
@@ -411,7 +413,10 @@ def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> boo
     """
     model = model.silenced()
 
-    groups = [[e for e in group if waiting(e.inputs)] for group in points.experiments]
+    groups = [
+        [e for e in compress(group, are_beginnings(group)) if waiting(e.inputs)]
+        for group in points.experiments
+    ]
     if not any(groups):
         return False
     models = [model.at(kappa) for kappa in points.kappa]

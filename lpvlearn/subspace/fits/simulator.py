@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.experiments import Experiment
+from ...data.experiments import Experiment, are_beginnings
 from ...exceptions import DivergenceError
 from ...models.innovation import InnovationModel
 from ...models.statespace import StateSpace, unknown_responses
@@ -78,9 +78,13 @@ class Simulator(NamedTuple):
         And not at rest about zero, or, where there are levels, about their means.
         """
         lti = self.lti
-        wait = [waiting(e.inputs) > 0 for e in experiments]
+        begin = are_beginnings(experiments)
+        wait = [
+            begins and waiting(e.inputs) > 0
+            for begins, e in zip(begin, experiments, strict=True)
+        ]
         # Of many short ones in motion some stand still by chance.
-        if not (lti.is_stable and 2 * sum(wait) >= len(wait)):
+        if not (lti.is_stable and 2 * sum(wait) >= sum(begin)):
             return False
         gain = lti.dc_gain()
         known = self.offsets.inputs, self.offsets.outputs, self.offsets.drifts
