@@ -71,14 +71,6 @@ from .one_basis.structured_models import (
     without_structure,
 )
 from .one_basis.together import through_black_boxes
-from .output_error import (
-    best_along,
-    known_coefficients,
-    local_covariance,
-    local_output_errors,
-    refine_model,
-    tell_of_missed,
-)
 from .points.common_choices import common_delay, identify_points
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.left_out import tell_of_two_points, tell_unforeseen
@@ -90,6 +82,9 @@ from .points.local_models import (
     tell_of_integrators,
 )
 from .points.mislabelled import tell_of_mislabelled
+from .refining.coefficients import known_coefficients, local_covariance, refine_model
+from .refining.errors import local_output_errors, tell_of_missed
+from .refining.starts import best_along
 from .reports.html_report import html_report
 from .reports.tables import Summary, Tables, summarise, tables
 from .running.memory import checked_memory
