@@ -29,6 +29,7 @@ FLOORS_OF_PIPELINE = (
     ("checks", "running", "steps"),
     ("points", "scheduled"),
     ("one_basis",),
+    ("refining",),
     ("output_error", "reports"),
     ("estimator",),
     ("model_files", "suggestion"),

@@ -201,25 +201,7 @@ def read_clock(
     t = seconds.astype(np.float64, copy=False)
     steps = np.diff(t)
     where = f"Time column {column!r} of experiment {experiment!r}"
-    if steps.min() <= 0:
-        k = int(np.argmin(steps > 0))
-        remedy = _USE_INSTEAD
-        if steps.min() == 0 and np.mean(steps == 0) > _OFTEN:
-            remedy = (
-                "Many stamps stand twice: they are rounded more coarsely than samples "
-                "come. Leave `time` out and give the step, `sampling_time`. If it is "
-                "the rows that stand twice, drop these (drop_duplicates of pandas)."
-            )
-        elif steps[k] == 0:
-            remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
-        elif local and _is_clock_change(steps, k):
-            remedy = _OF_A_ZONE
-        elif np.sum(steps <= 0) <= _FEW * len(t):
-            remedy = _RESTARTS + remedy
-        raise ValueError(
-            f"{where} must increase. Got {t[k]:.9g} s followed by {t[k + 1]:.9g} s at "
-            f"its samples {k} and {k + 1}. {remedy}"
-        )
+    _check_increasing(t, steps, where, local)
     missing = missing_after(steps)
     kept = steps[~missing] if missing.any() else steps
     step, off = float(kept.mean()), _off_grid(t, missing)
@@ -245,27 +227,8 @@ def read_clock(
             f"the step (here {time_tol:g}). For more, lpvlearn.resample puts the "
             f"record on an even grid. {_USE_INSTEAD}"
         )
-    if missing.any() and not allow_missing:
-        k = int(np.argmax(missing))
-        remedy = _CUT_THERE
-        if local and _is_clock_change(steps, k):
-            remedy = f"{_OF_A_ZONE} Where the logger rested: {remedy}"
-        if missing.sum() > _FEW * len(t):
-            remedy = (
-                f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"
-            )
-            if np.sum(missing[1:] & missing[:-1]) > missing.sum() // 2:
-                longest = np.quantile(steps[missing], 0.9)
-                remedy = (
-                    "If the logger changed its rate, lpvlearn.resample with "
-                    f"sampling_time={longest:.3g} puts all of it on one grid. {remedy}"
-                )
-        n_missing = np.maximum(1, np.rint(steps[missing] / step) - 1).sum()
-        raise ValueError(
-            f"{where} must be evenly spaced. Got a step of {steps[k]:.9g} s after its "
-            f"sample {k}, against {step:.9g} s elsewhere: about {n_missing:.0f} row(s) "
-            f"are missing, at {missing.sum()} place(s). {remedy}"
-        )
+    if not allow_missing:
+        _check_complete(steps, missing, step, where, local)
     slack = 2 * (rounding + time_tol * step) / (len(t) - 1 - missing.sum())
     for clock, rule in expected:
         known = step if clock.step is None else clock.step
@@ -277,6 +240,64 @@ def read_clock(
         )
     jitter = float(np.abs(off).max()) / step
     return Clock(step, jitter, np.flatnonzero(missing) + 1, slack)
+
+
+def _check_increasing(
+    t: NDArray[np.float64], steps: NDArray[np.float64], where: str, local: bool
+) -> None:
+    """Refuse stamps that stay or go back, with the remedy for what they look like."""
+    if not steps.min() <= 0:
+        return
+    k = int(np.argmin(steps > 0))
+    remedy = _USE_INSTEAD
+    if steps.min() == 0 and np.mean(steps == 0) > _OFTEN:
+        remedy = (
+            "Many stamps stand twice: they are rounded more coarsely than samples "
+            "come. Leave `time` out and give the step, `sampling_time`. If it is "
+            "the rows that stand twice, drop these (drop_duplicates of pandas)."
+        )
+    elif steps[k] == 0:
+        remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
+    elif local and _is_clock_change(steps, k):
+        remedy = _OF_A_ZONE
+    elif np.sum(steps <= 0) <= _FEW * len(t):
+        remedy = _RESTARTS + remedy
+    raise ValueError(
+        f"{where} must increase. Got {t[k]:.9g} s followed by {t[k + 1]:.9g} s at "
+        f"its samples {k} and {k + 1}. {remedy}"
+    )
+
+
+def _check_complete(
+    steps: NDArray[np.float64],
+    missing: NDArray[np.bool_],
+    step: float,
+    where: str,
+    local: bool,
+) -> None:
+    """Refuse missing samples, with the remedy for what they look like."""
+    if not missing.any():
+        return
+    k = int(np.argmax(missing))
+    remedy = _CUT_THERE
+    if local and _is_clock_change(steps, k):
+        remedy = f"{_OF_A_ZONE} Where the logger rested: {remedy}"
+    if missing.sum() > _FEW * (len(steps) + 1):
+        remedy = (
+            f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"
+        )
+        if np.sum(missing[1:] & missing[:-1]) > missing.sum() // 2:
+            longest = np.quantile(steps[missing], 0.9)
+            remedy = (
+                "If the logger changed its rate, lpvlearn.resample with "
+                f"sampling_time={longest:.3g} puts all of it on one grid. {remedy}"
+            )
+    n_missing = np.maximum(1, np.rint(steps[missing] / step) - 1).sum()
+    raise ValueError(
+        f"{where} must be evenly spaced. Got a step of {steps[k]:.9g} s after its "
+        f"sample {k}, against {step:.9g} s elsewhere: about {n_missing:.0f} row(s) "
+        f"are missing, at {missing.sum()} place(s). {remedy}"
+    )
 
 
 def missing_after(

@@ -33,7 +33,7 @@ from ..data.operating_points import (
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.tables import as_list, read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing, collected, retold, take_back, warn
+from ..exceptions import Told, all_or_nothing, collected, retold, take_back, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
@@ -71,14 +71,6 @@ from .one_basis.structured_models import (
     without_structure,
 )
 from .one_basis.together import through_black_boxes
-from .output_error import (
-    best_along,
-    known_coefficients,
-    local_covariance,
-    local_output_errors,
-    refine_model,
-    tell_of_missed,
-)
 from .points.common_choices import common_delay, identify_points
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.left_out import tell_of_two_points, tell_unforeseen
@@ -90,6 +82,9 @@ from .points.local_models import (
     tell_of_integrators,
 )
 from .points.mislabelled import tell_of_mislabelled
+from .refining.coefficients import known_coefficients, local_covariance, refine_model
+from .refining.errors import local_output_errors, tell_of_missed
+from .refining.starts import best_along
 from .reports.html_report import html_report
 from .reports.tables import Summary, Tables, summarise, tables
 from .running.memory import checked_memory
@@ -530,7 +525,6 @@ list, default=None
         memory = checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
         restructurer, watch = self.restructurer, Stopwatch(verbose=self.verbose)
-        efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
             experiments = without_spikes(read())
@@ -550,39 +544,8 @@ list, default=None
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
         with watch.step("local models", bar=True), retold() as told:  # step 3
-            identify = partial(
-                identify_points,
-                structure=structure,
-                sampling_time=self.sampling_time_,
-                combine=self.combine,
-                discretization=self.discretization,
-                efficient=self.efficient or efficient,
-                deviate=self._needs_deviations(),
-            )
-            estimator, whole = self._local(), points
-            if self.offsets == "auto":
-                (local, kept), points, estimator = identified_as_held(
-                    estimator, points, identify, runner
-                )
-            else:
-                local, kept = identify(estimator, points, runner)
-            longest = self.sampling_time_ * kept.n_longest
-            channels = experiments[0].input_names, self.output_names_
-            wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
-            if restructurer in (None, "aligned") and not wrong:
-                quiet = replace(runner, verbose=0)
-                again = partial(identify, points=kept, runner=quiet)
-                said = len(told)
-                order = _foreseen_order(estimator, local, kept, longest, again)
-                if order is not None:
-                    del told[:said]  # of the models of more states
-                    estimator = clone(estimator).set_params(order=order)
-                    local, kept = identify(estimator, points, runner)
-                tell_of_integrators(local, self.output_names_, longest)
-            take_back(LINE)  # the LPV model rests where it begins
-            if points is not whole:
-                tell_of_held(experiments[0].scheduling_names)
-            points = kept
+            first = experiments[0]
+            local, points = self._identified(points, structure, first, runner, told)
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
@@ -648,23 +611,7 @@ list, default=None
             )
             longest = self.sampling_time_ * found.points.n_longest
             growth = growth_rates(self.lpv_, kappa, longest)
-            form = getattr(self.interpolator_, "best_estimator_", None)
-            if form is not None:
-                tell_of_two_points(self.structured_models_, kappa, longest)
-            n_places = len(np.unique(kappa, axis=0))
-            repeated = (len(kappa) - n_places) * found.theta.shape[1]
-            dof = getattr(form, "degrees_of_freedom_", np.inf)
-            saturated = not moving and dof <= repeated
-            if isinstance(form, SplineLPV) or (saturated and n_places > 2):
-                tell_unforeseen(
-                    self.lpv_,
-                    self.structured_models_,
-                    SplineLPV() if saturated else form,
-                    kappa,
-                    found.theta,
-                    longest,
-                    saturated=saturated,
-                )
+            self._tell_between(found, longest, bool(moving))
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_ = report.parameters
             self.parameters_std_ = report.deviations
@@ -840,6 +787,76 @@ list, default=None
         if n_points == 1:
             return PolynomialLPV(degree=0)
         return AutoLPV() if self.interpolator is None else clone(self.interpolator)
+
+    def _identified(
+        self,
+        points: OperatingPoints,
+        structure: GrayBoxStructure | None,
+        first: Experiment,
+        runner: PointRunner,
+        told: list[Told],
+    ) -> tuple[list[LocalModel], OperatingPoints]:
+        """Local models of the points that have one, and these points.
+
+        What was `told` of models is taken back where others are taken for them.
+        """
+        efficient = getattr(self.restructurer, "norm", None) == "covariance"
+        identify = partial(
+            identify_points,
+            structure=structure,
+            sampling_time=self.sampling_time_,
+            combine=self.combine,
+            discretization=self.discretization,
+            efficient=self.efficient or efficient,
+            deviate=self._needs_deviations(),
+        )
+        estimator, whole = self._local(), points
+        if self.offsets == "auto":
+            (local, kept), points, estimator = identified_as_held(
+                estimator, points, identify, runner
+            )
+        else:
+            local, kept = identify(estimator, points, runner)
+        longest = self.sampling_time_ * kept.n_longest
+        channels = first.input_names, self.output_names_
+        wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
+        if self.restructurer in (None, "aligned") and not wrong:
+            quiet = replace(runner, verbose=0)
+            again = partial(identify, points=kept, runner=quiet)
+            said = len(told)
+            order = _foreseen_order(estimator, local, kept, longest, again)
+            if order is not None:
+                del told[:said]  # of the models of more states
+                estimator = clone(estimator).set_params(order=order)
+                local, kept = identify(estimator, points, runner)
+            tell_of_integrators(local, self.output_names_, longest)
+        take_back(LINE)  # the LPV model rests where it begins
+        if points is not whole:
+            tell_of_held(first.scheduling_names)
+        return local, kept
+
+    def _tell_between(
+        self, found: StructuredModels, longest: float, moving: bool
+    ) -> None:
+        """Tell of points that the others do not foresee, or are too few to."""
+        kappa = found.points.kappa
+        form = getattr(self.interpolator_, "best_estimator_", None)
+        if form is not None:
+            tell_of_two_points(self.structured_models_, kappa, longest)
+        n_places = len(np.unique(kappa, axis=0))
+        repeated = (len(kappa) - n_places) * found.theta.shape[1]
+        dof = getattr(form, "degrees_of_freedom_", np.inf)
+        saturated = not moving and dof <= repeated
+        if isinstance(form, SplineLPV) or (saturated and n_places > 2):
+            tell_unforeseen(
+                self.lpv_,
+                self.structured_models_,
+                SplineLPV() if saturated else form,
+                kappa,
+                found.theta,
+                longest,
+                saturated=saturated,
+            )
 
     def _fit_offsets(self, found: StructuredModels, tell: bool) -> Any:
         """Interpolation of inputs, outputs and states at rest; None for none."""

@@ -302,24 +302,7 @@ def problem_from_models(
         _check_time(structure, first.sampling_time)
     structure = _structure_for(structure, first)
     p, dt = structure.n_outputs, first.sampling_time
-    for model in models:
-        if model.D.shape != (p, structure.n_inputs):
-            raise ValueError(
-                f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
-                f"has {model.n_outputs} and {model.n_inputs}. They must agree; an "
-                "input too many is often a column whose role was forgotten (`time=`, "
-                "`scheduling=`, `experiment=`)."
-            )
-        if model.sampling_time != dt:
-            raise ValueError(
-                "models to be matched together must have one sampling time. Got "
-                f"{dt} and {model.sampling_time}."
-            )
-        if not np.allclose(model.input_delay, first.input_delay, rtol=_SAME, atol=0.0):
-            raise ValueError(
-                "`model` must be models of one `input_delay` to be matched together. "
-                f"Got {first} and {model}. Give them the same by with_input_delay()."
-            )
+    _check_alike(models, structure)
     boxes = [
         Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
         for m in models
@@ -366,6 +349,30 @@ def problem_from_models(
         division,
         lacks_poles=lacks_poles,
     )
+
+
+def _check_alike(models: Sequence[StateSpace], structure: GrayBoxStructure) -> None:
+    """Refuse models that cannot be matched by one structure together."""
+    first = models[0]
+    p, dt = structure.n_outputs, first.sampling_time
+    for model in models:
+        if model.D.shape != (p, structure.n_inputs):
+            raise ValueError(
+                f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
+                f"has {model.n_outputs} and {model.n_inputs}. They must agree; an "
+                "input too many is often a column whose role was forgotten (`time=`, "
+                "`scheduling=`, `experiment=`)."
+            )
+        if model.sampling_time != dt:
+            raise ValueError(
+                "models to be matched together must have one sampling time. Got "
+                f"{dt} and {model.sampling_time}."
+            )
+        if not np.allclose(model.input_delay, first.input_delay, rtol=_SAME, atol=0.0):
+            raise ValueError(
+                "`model` must be models of one `input_delay` to be matched together. "
+                f"Got {first} and {model}. Give them the same by with_input_delay()."
+            )
 
 
 def _check_size(norm: float) -> None:

@@ -16,8 +16,7 @@ from ..conftest import (
     spring_sweep,
     spring_tables,
 )
-from .conftest import N_SAMPLES
-from .test_output_error import sweeps
+from .conftest import N_SAMPLES, sweeps
 
 PARTS = ["parameters", "model_error", "total", "measurement"]
 

@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy import linalg
 
+from lpvlearn import SubspaceLTI
 from lpvlearn.subspace.orders import identification
 from lpvlearn.subspace.samples.records import scale_records
 from lpvlearn.subspace.simulation_error.simulation_fit import Freedom
@@ -119,6 +121,20 @@ def closed_loop(
         u[t] = r[t] - gain * (y[t - delay] if t >= delay else 0.0)
         x = A @ x + B[:, 0] * u[t] + (drive * e[t] if pole is None else 0.0)
     return u[:, None], y[:, None]
+
+
+def matrices(model):
+    return model.lti_.A, model.lti_.B, model.lti_.C, model.lti_.D
+
+
+def miss(model, plant=LOOP_PLANT):
+    """Relative error of the impulse response."""
+    truth = markov(*plant, n=100)
+    return linalg.norm(markov(*matrices(model), n=100) - truth) / linalg.norm(truth)
+
+
+def pbsid(order="auto", **options):
+    return SubspaceLTI(order, method="pbsid", **options)
 
 
 def fed(model, u, y, sizes):

@@ -8,18 +8,18 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import linalg
 from scipy.signal import decimate, lfilter
-from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
-from lpvlearn.subspace.closed_loop.pbsid import _Changes, _Innovation, _riccati_gain
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
 from .conftest import (
-    LOOP_PLANT,
     closed_loop,
     experiment,
     markov,
+    matrices,
+    miss,
+    pbsid,
     record,
     sweep_of_a_hardening_spring,
 )
@@ -37,20 +37,6 @@ def unstable_loop(seed, n_samples=1500):
     rng = np.random.default_rng(seed)
     drive = np.array([0.5, 0.2])
     return closed_loop(rng, n_samples, UNSTABLE, gain=0.8, delay=1, drive=drive)
-
-
-def matrices(model):
-    return model.lti_.A, model.lti_.B, model.lti_.C, model.lti_.D
-
-
-def miss(model, plant=LOOP_PLANT):
-    """Relative error of the impulse response."""
-    truth = markov(*plant, n=100)
-    return linalg.norm(markov(*matrices(model), n=100) - truth) / linalg.norm(truth)
-
-
-def pbsid(order="auto", **options):
-    return SubspaceLTI(order, method="pbsid", **options)
 
 
 # -- what is identified ----------------------------------------------------------------
@@ -78,17 +64,6 @@ def test_the_error_falls_under_feedback_where_that_of_others_stays():
         errors["pbsid"].append(miss(pbsid(feedthrough=False).fit(u, y)))
     assert errors["po-moesp"][1] > 0.15
     assert errors["pbsid"][1] < 0.03 and errors["pbsid"][0] < 0.1
-
-
-@pytest.mark.parametrize("order", [2, "auto"])
-def test_modes_of_the_noise_are_told_from_the_plant(order):
-    u, y = closed_loop(np.random.default_rng(1), 2000, pole=0.9)
-    model = pbsid(order, feedthrough=False).fit(u, y)
-    predictor = model.predictor_
-    assert (model.order_, predictor.n_noise_states) == (2, 1)
-    assert_allclose(predictor.noise.A, [[0.9]], atol=0.05)
-    assert miss(model) < 0.03
-    assert not predictor.B[2:].any()
 
 
 def test_a_plant_may_be_unstable():
@@ -283,19 +258,6 @@ def test_orders_that_no_modes_add_up_to_are_those_of_the_subspace(system):
         assert pbsid(0).fit(u, y).order_ == 0
     noisy = pbsid(5, n_noise_states=2, refine=False).fit(u, y)
     assert noisy.order_ == 5 and noisy.predictor_.n_noise_states == 2
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"horizon": 30}, "needs more than 62 windows of 30 past samples"),
-        ({"order": 6, "horizon": 4}, "`horizon` must be at least 6 for order 6"),
-    ],
-)
-def test_windows_are_refused_with_the_remedy(options, message):
-    u, y = closed_loop(np.random.default_rng(0), 60)
-    with pytest.raises(ValueError, match=message):
-        pbsid(**{"order": 2, **options}).fit(u, y)
 
 
 def test_streams_are_refused():
@@ -575,13 +537,6 @@ def test_a_pole_that_grows_beyond_chance_is_not_told_to_be_enforced_first(rng):
         SubspaceLTI(1, method="po-moesp").fit(u[:, None], y)
 
 
-def test_states_that_grow_unseen_ask_for_fewer_of_them():
-    """Their Riccati equation has no solution, which SciPy says in words of its own."""
-    W, E = np.eye(3)[:2], np.eye(3)[2:]
-    with pytest.raises(ValueError, match="lower `order` or method='po-moesp'"):
-        _riccati_gain(np.diag([2.0, 0.5]), np.array([[0.0, 1.0]]), W, E, 3)
-
-
 def test_auto_is_po_moesp_in_open_loop(system):
     u, y = record(system, 500)
     model = SubspaceLTI(5).fit(u, y)
@@ -716,72 +671,6 @@ def test_a_split_must_be_as_likely_as_the_whole(seed):
     assert model.residual_ < 1.1 * whole.residual_
 
 
-# -- uncertainty -----------------------------------------------------------------------
-
-
-def test_a_part_changes_as_its_response_does():
-    """First-order changes of a part against its modes of the changed model."""
-    rng = np.random.default_rng(0)
-    A = modes(0.9 * np.exp(0.5j), 0.7, -0.4)
-    B, C = rng.standard_normal((4, 2)), rng.standard_normal((2, 4))
-    D, K = np.zeros((2, 2)), np.zeros((4, 2))
-    model, part = _Innovation(A, B, C, D, K, np.eye(2)), np.array([1, 1, 0, 1]) > 0
-
-    def response(A, B, C, of):
-        """Of the modes whose poles are near those of the part."""
-        poles, T = np.linalg.eig(A)
-        near = np.abs(poles[:, None] - np.linalg.eigvals(of)).min(axis=1) < 0.05
-        assert near.sum() == 3
-        left = np.linalg.inv(T)[near] @ B
-        return [C @ T[:, near] @ np.diag(poles[near] ** k) @ left for k in range(8)]
-
-    step = [1e-5 * rng.standard_normal((1, *M.shape)) for M in model[:4]]
-    change = _Changes(*step).of_part(model, part)
-    own = A[part][:, part], B[part], C[:, part]
-    moved = [M + d[0] for M, d in zip(own, change, strict=False)]
-    expected = response(
-        *(M + d[0] for M, d in zip((A, B, C), step, strict=False)), own[0]
-    )
-    found = markov(*moved, D, n=8)[1:]
-    assert_allclose(found, np.real(expected), atol=1e-8)
-
-
-def test_the_predictor_has_the_least_prediction_error():
-    u, y = closed_loop(np.random.default_rng(5), 800)
-    model = pbsid(2, feedthrough=False).fit(u, y)
-    raw = pbsid(2, feedthrough=False, refine=False).fit(u, y)
-    assert model.residual_ < raw.residual_ < 1.02 * model.residual_
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pole", [None, 0.9])
-def test_standard_deviations_cover(pole):
-    omega = np.array([0.2, 0.8, 2.0])
-    A, B, C, _ = LOOP_PLANT
-    z = np.exp(1j * omega)[:, None, None]
-    truth = C @ np.linalg.solve(z * np.eye(2) - A, np.broadcast_to(B, (3, 2, 1)))
-    top = np.linalg.eigvals(A)[0]
-    inside = []
-    for seed in range(40):
-        u, y = closed_loop(np.random.default_rng(seed), 1500, pole=pole)
-        model = pbsid(2, feedthrough=False).fit(u, y)
-        k = np.argmax(model.lti_.poles().imag)
-        values = [
-            (model.lti_.poles()[k] - top, model.poles_std_[k]),
-            *zip(
-                (model.lti_.frequency_response(omega) - truth).ravel(),
-                model.frequency_response_std(omega).ravel(),
-                strict=True,
-            ),
-        ]
-        for error, std in values:
-            inside += [abs(error.real) < 1.96 * std.real]
-            inside += [abs(error.imag) < 1.96 * std.imag]
-    # Errors of one record depend on each other: as many as its parameters count.
-    low, high = binom.interval(0.99, 40 * 4, 0.95)
-    assert low <= np.mean(inside) * 160 <= high + 1
-
-
 @pytest.mark.filterwarnings("ignore:Output 1 is .* in all samples")
 def test_outputs_of_zero_and_tiny_tables_have_a_model():
     rng = np.random.default_rng(0)
@@ -791,18 +680,6 @@ def test_outputs_of_zero_and_tiny_tables_have_a_model():
     for n in (10, 15, 21):
         y = lfilter([0.0, 1.0], [1.0, -0.5], u[:n, 0])
         assert np.isfinite(pbsid().fit(u[:n], y).lti_.A).all()
-
-
-def test_a_record_in_other_words():
-    """The innovation form: x[t+1] = A x + B u + K e, from e and u."""
-    u, y = closed_loop(np.random.default_rng(0), 500, pole=0.9)
-    model = pbsid(feedthrough=False).fit(u, y)
-    P = model.predictor_
-    x0 = P.estimate_initial_state(u, y)
-    e = y - P.predict(u, y, initial_state=x0)
-    driven = np.hstack([u, e])
-    B, D = np.hstack([P.B, P.K]), np.hstack([P.D, np.eye(1)])
-    assert_allclose(lti_response(P.A, B, P.C, D, driven, x0), y, atol=1e-8)
 
 
 def test_a_reference_of_few_sines_is_told():
@@ -838,51 +715,6 @@ def test_a_controller_is_not_taken_for_the_feedthrough_of_its_plant(seed):
     G = true.frequency_response(omega)
     error = np.abs(model.lti_.frequency_response(omega) - G) / np.abs(G)
     assert error.mean() < 0.15
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_clean_output_keeps_its_part_of_a_given_order(seed):
-    """No input reaches the noise: not to first order where that is worse."""
-    rng = np.random.default_rng(seed)
-    u, w, v = (rng.standard_normal(400) for _ in range(3))
-    true = StateSpace([[0.8, 0.2], [-0.2, 0.8]], [[1], [0]], [[1, 0]], None, True)
-    exact, noise = true.simulate(u)[:, 0], lfilter([1.0], [1.0, -0.9], 0.3 * w)
-    y = np.column_stack([exact + noise, exact + 1e-3 * v])
-    model = SubspaceLTI(2, method="pbsid").fit(u[:, None], y)
-    lti = model.lti_
-    row = StateSpace(lti.A, lti.B, lti.C[1:], lti.D[1:], True)
-    assert (row - true).hinf_norm() / true.hinf_norm() < 5e-4
-    error = (y - model.predict_ahead(u[:, None], y))[20:]
-    said = np.sqrt(np.diagonal(model.predictor_.covariance))
-    np.testing.assert_allclose(error.std(axis=0), said, rtol=0.1)
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_states_of_the_disturbance_are_not_taken_from_a_given_order(seed):
-    """A turbine's drivetrain in wind, whose state the subspace hardly shows."""
-    rng, step, n = np.random.default_rng(seed), 0.05, 6000
-    rotor, generator, stiffness, loss, ratio = 4.4e7, 5.03e6, 8.68e8, 6.2e6, 97.0
-    damping, torque = 2.78e6, 5.25e5
-    A = np.array(
-        [
-            [-(loss + damping) / rotor, loss / rotor, -stiffness / rotor],
-            [loss / generator, -loss / generator, stiffness / generator],
-            [1.0, -1.0, 0.0],
-        ]
-    )
-    B = [[0, torque / rotor], [-1e3 * ratio / generator, 0], [0, 0]]
-    plant = StateSpace(A, B, [[0, 926.0, 0], [9.55, 0, 0]]).to_discrete(step)
-    fast, slow = np.sign(rng.standard_normal((2, n)))
-    u = fast[::3].repeat(3)[:n] + 1.5 * slow[::60].repeat(60)[:n]
-    wind = lfilter([1.0], [1.0, -0.98], np.sqrt(1 - 0.98**2) * rng.standard_normal(n))
-    y = plant.simulate(np.column_stack([u, 0.15 * wind]))
-    y += [1.0, 0.01] * rng.standard_normal(y.shape)
-    model = SubspaceLTI(3, method="pbsid", feedthrough=False, sampling_time=step)
-    model.fit(u[:, None], y)
-    poles, true = model.lti_.poles(), plant.poles()
-    slow = true[np.argmin(np.abs(true - 1.0))]
-    k = int(np.argmin(np.abs(poles - slow)))
-    assert abs(poles[k].real - slow.real) < 2.5 * model.poles_std_[k].real
 
 
 def car_with_biases(seed, speed=32.0, n_samples=4000, step=0.01):

@@ -105,17 +105,7 @@ def restructure_points(
     """
     began = perf_counter()
     if isinstance(restructurer, str):
-        longest = sampling_time * points.n_longest
-        if restructurer == "aligned":
-            sizes = channel_sizes(points.experiments)
-            structure, theta = aligned_black_boxes(local, points.kappa, *sizes, longest)
-        else:
-            tell_of_forced(local, points.kappa, longest)
-            models = [balanced(model) for model in local]
-            structure, theta = balanced_entries(models, local[0].integrating)
-        models = _delayed(structure, theta, local)
-        unknown = _unknown_covariance(theta)
-        return StructuredModels(points, local, structure, theta, unknown, models, [])
+        return _black_boxes(restructurer, local, points, sampling_time)
     restructurer = _with_structure(restructurer, local)
     if max_time is not None:
         at_once = min(effective_n_jobs(runner.n_jobs), len(local))
@@ -179,6 +169,23 @@ def restructure_points(
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _black_boxes(
+    states: str, local: list[LocalModel], points: OperatingPoints, sampling_time: float
+) -> StructuredModels:
+    """The balanced models, "aligned" or not: their entries are the parameters."""
+    longest = sampling_time * points.n_longest
+    if states == "aligned":
+        sizes = channel_sizes(points.experiments)
+        structure, theta = aligned_black_boxes(local, points.kappa, *sizes, longest)
+    else:
+        tell_of_forced(local, points.kappa, longest)
+        models = [balanced(model) for model in local]
+        structure, theta = balanced_entries(models, local[0].integrating)
+    models = _delayed(structure, theta, local)
+    unknown = _unknown_covariance(theta)
+    return StructuredModels(points, local, structure, theta, unknown, models, [])
 
 
 def with_foreseen(found: StructuredModels) -> StructuredModels:

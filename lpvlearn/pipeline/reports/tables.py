@@ -323,58 +323,80 @@ def summarise(
         hidden.append("growth_rate")
     restructured = "structured_BFT" in report
     if restructured:
-        error, floor = 100 * report["relative_error"], 100 * report["relative_floor"]
-        remaining = 100 * report["remaining_error"]
-        has_floor = report["relative_floor"].max() > _NO_FLOOR
-        place = (
-            f"the largest at {_label_of_largest(remaining)} near "
-            f"{report['active_frequency'].iloc[_largest(remaining)]:.4g} rad/s"
-        )
-        weighed, spot = "p_value" in report, "" if has_floor else f", {place}"
-        lines += [
-            f"Restructuring: {restructurer}, "
-            f"simulation fit (BFT) {_span(report['structured_BFT'])} %",
-            f"    H-infinity error {_span(error)} % of the black box's norm"
-            + ("" if weighed else spot),
-        ]
-        if has_floor:
-            lines += [
-                f"    of which no parameter can change {_span(floor)} %",
-                f"    apart from that, {_span(remaining)} %, {place}",
-            ]
-        if weighed:
-            best = 100 * report["relative_hinf_error"]
-            misfit = report["chi2"] / report["degrees_of_freedom"].clip(lower=1)
-            lines.append(f"    that of the H-infinity optimum {_span(best)} %{spot}")
-            if misfit.notna().any():  # none of exact data
-                lines.append(
-                    "    in the black box's standard deviations: chi-square per degree "
-                    f"of freedom {_span(misfit)}"
-                )
-        # Without a floor, all of the error remains.
-        hidden += (
-            ["relative_error"] if has_floor else ["relative_floor", "remaining_error"]
-        )
-        unknown = int(found.deviations.isna().all(axis=1).sum())
-        if unknown:
-            lines.append(
-                f"    standard deviations of the parameters are not known at {unknown} "
-                "point(s): see `parameters_std_`"
-            )
+        of_step, more = _nearness(found, restructurer)
+        hidden += more
     else:
-        basis = {
-            "aligned": "each turned to its neighbour",
-            "canonical": "in the observable canonical form",
-        }.get(restructurer, "which have no common state basis")
+        of_step = [_without_structure(restructurer)]
+    lines += [*of_step, *_interpolation(found, lpv, kappa)]
+    if len(kappa) == 1:
+        lines.append("One operating point: the model is time-invariant.")
+    shown = [name for name in report.columns if not name.startswith(tuple(hidden))]
+    parameters = None
+    if restructured:
+        parameters = readable_report(found.by_parameter.dropna(axis=1, how="all"))
+    return Summary(lines, readable_report(report[shown]), parameters)
+
+
+def _nearness(found: Tables, restructurer: str) -> tuple[list[str], list[str]]:
+    """How near the structure comes to the black boxes; columns that need no place."""
+    report = found.points
+    error, floor = 100 * report["relative_error"], 100 * report["relative_floor"]
+    remaining = 100 * report["remaining_error"]
+    has_floor = report["relative_floor"].max() > _NO_FLOOR
+    place = (
+        f"the largest at {_label_of_largest(remaining)} near "
+        f"{report['active_frequency'].iloc[_largest(remaining)]:.4g} rad/s"
+    )
+    weighed, spot = "p_value" in report, "" if has_floor else f", {place}"
+    lines = [
+        f"Restructuring: {restructurer}, "
+        f"simulation fit (BFT) {_span(report['structured_BFT'])} %",
+        f"    H-infinity error {_span(error)} % of the black box's norm"
+        + ("" if weighed else spot),
+    ]
+    if has_floor:
+        lines += [
+            f"    of which no parameter can change {_span(floor)} %",
+            f"    apart from that, {_span(remaining)} %, {place}",
+        ]
+    if weighed:
+        best = 100 * report["relative_hinf_error"]
+        misfit = report["chi2"] / report["degrees_of_freedom"].clip(lower=1)
+        lines.append(f"    that of the H-infinity optimum {_span(best)} %{spot}")
+        if misfit.notna().any():  # none of exact data
+            lines.append(
+                "    in the black box's standard deviations: chi-square per degree "
+                f"of freedom {_span(misfit)}"
+            )
+    # Without a floor, all of the error remains.
+    hidden = ["relative_error"] if has_floor else ["relative_floor", "remaining_error"]
+    unknown = int(found.deviations.isna().all(axis=1).sum())
+    if unknown:
         lines.append(
-            "Restructuring: none; the entries of black boxes are interpolated, " + basis
+            f"    standard deviations of the parameters are not known at {unknown} "
+            "point(s): see `parameters_std_`"
         )
+    return lines, hidden
+
+
+def _without_structure(states: str) -> str:
+    """That there is none, and of what the states of the black boxes are."""
+    basis = {
+        "aligned": "each turned to its neighbour",
+        "canonical": "in the observable canonical form",
+    }.get(states, "which have no common state basis")
+    return "Restructuring: none; the entries of black boxes are interpolated, " + basis
+
+
+def _interpolation(found: Tables, lpv: LPVStateSpace, kappa: Array) -> list[str]:
+    """How near the interpolation comes to the models of the operating points."""
+    report = found.points
     distance = 100 * report["interpolation_error"]
     form = getattr(lpv.interpolator, "form_", "")
     theta = found.parameters.to_numpy()
     size = _sizes(theta)
     fit = parameter_fit(theta / size, lpv.parameters(kappa) / size)
-    lines += [
+    lines = [
         f"Interpolation: {lpv.interpolator}{form and f' ({form})'}, "
         f"parameter fit (FIT) {fit:.2f} %",
     ]
@@ -390,13 +412,7 @@ def summarise(
             "    through the local models: how good it is between them only data there "
             "tell"
         )
-    if len(kappa) == 1:
-        lines.append("One operating point: the model is time-invariant.")
-    shown = [name for name in report.columns if not name.startswith(tuple(hidden))]
-    parameters = None
-    if restructured:
-        parameters = readable_report(found.by_parameter.dropna(axis=1, how="all"))
-    return Summary(lines, readable_report(report[shown]), parameters)
+    return lines
 
 
 def _sizes(theta: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...data.preparation import DETRENDS
 from ...systems.modes import HARDLY_DECAYS, spectral_radius
-from ..closed_loop.pbsid import ClosedLoopEvidence
+from ..closed_loop.plant_and_noise import ClosedLoopEvidence
 from ..closed_loop.varx import Regression
 from ..evidence.constants import CERTAIN, follows_means_alone
 from ..evidence.rounding import rounded_outputs
