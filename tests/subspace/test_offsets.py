@@ -1,6 +1,7 @@
 """Constants and drifts of the experiments, estimated with the model."""
 
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,11 @@ from lpvlearn.subspace.evidence.constants import (
     stands_by_chance,
     without_slow_modes,
 )
-from lpvlearn.subspace.evidence.offsets import attributed, far_off
+from lpvlearn.subspace.evidence.offsets import (
+    _as_they_begin,
+    attributed,
+    far_off,
+)
 from lpvlearn.subspace.samples import hankel
 from lpvlearn.subspace.samples.records import Record, centred
 from lpvlearn.subspace.simulation_error.simulation_fit import (
@@ -345,6 +350,19 @@ def test_constants_are_seen_through_noise_of_long_memory(seed, offset):
         model = SubspaceLTI().fit(u + 100.0, y + [1.0, 180.0])
     # Where the noise looks like a line, no state follows it.
     assert (model.order_, model.offset_) == (1, offset)
+
+
+def test_a_model_that_grows_beyond_all_squares_has_no_beginning(rng):
+    u = rng.standard_normal((400, 1))
+    y = lti_response(*(np.eye(1) * k for k in (0.9, 1.0, 1.0, 0.0)), u, np.zeros(1))
+    known = SubspaceLTI(1).fit(u, y)._evidence
+    grows = known.model._replace(
+        A=np.array([[4.0]]), initial_states=np.ones((1, 1)), blocks=None
+    )
+    found = _as_they_begin(
+        replace(known, model=grows), np.ones((1, 1, 1)), np.array([400])
+    )
+    assert found is None
 
 
 def test_an_offset_of_an_integrators_input_is_a_line(rng):

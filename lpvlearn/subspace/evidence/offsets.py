@@ -162,8 +162,10 @@ def _as_they_begin(
         size[m + ny :] /= _RELUCTANTLY
         x = linalg.lstsq(columns / size, target.ravel(), _RCOND)[0]
         left = target.ravel() - columns / size @ x
-        most = _UNSEEN * noise + _NEARLY * target.std(axis=0).max()
-        if not np.sqrt(np.mean(left**2)) <= most:
+        with np.errstate(over="ignore", invalid="ignore"):  # of a model that grows
+            most = _UNSEEN * noise + _NEARLY * target.std(axis=0).max()
+            explained = np.sqrt(np.mean(left**2)) <= most < np.inf
+        if not explained:
             return None
         found.append((x / size)[: m + ny])
     u0, y0 = np.split(np.array(found), [m], axis=1)
