@@ -232,6 +232,15 @@ def integrators(structure: GrayBoxStructure) -> int:
     return _directions(_blocks(structure, thetas[0])[0], 0.0, _FIXED).shape[1]
 
 
+def poles_at_zero(structure: GrayBoxStructure) -> int:
+    """How many poles at zero the structure has for all parameters, chains and all."""
+    thetas = _drawn(structure)
+    if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
+        return 0
+    A = _blocks(structure, thetas[0])[0]
+    return len(A) - len(_without(A, 0.0))
+
+
 def hidden_integrators(structure: GrayBoxStructure) -> int:
     """How many of them no output shows, or no input reaches, for all parameters.
 

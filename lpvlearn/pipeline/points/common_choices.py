@@ -19,7 +19,11 @@ from sklearn.base import clone
 from ...data.experiments import Experiment
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, warn
-from ...restructuring.known_poles import hidden_integrators, integrators
+from ...restructuring.known_poles import (
+    hidden_integrators,
+    integrators,
+    poles_at_zero,
+)
 from ...structures.structure import GrayBoxStructure
 from ...subspace.estimator import SubspaceLTI
 from ...subspace.fits.delay import with_late_inputs
@@ -63,6 +67,8 @@ def identify_points(
     free = is_left(local, "order")
     chooses = free or isinstance(given, range | list | tuple | np.ndarray)
     local, options["most"] = of_structure(local, structure)
+    if isinstance(structure, GrayBoxStructure):
+        options["n_at_zero"] = poles_at_zero(structure)
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 

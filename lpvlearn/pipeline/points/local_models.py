@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,7 @@ def identify_point(
     efficient: bool = False,
     deviate: bool = True,
     most: bool = False,
+    n_at_zero: int = 0,
 ) -> LocalModel:
     """Identify the local model of one operating point by a clone of `local`.
 
@@ -122,7 +123,8 @@ def identify_point(
     an unstable model, which cannot be balanced. `efficient` gives `estimates`,
     `deviate` the `pairs` of a pooled one, which these need. The order may be the `most`
     that there can be: a pooled model then leaves out states that the samples do not ask
-    for, where they alternate. In a loop those of a disturbance come to it.
+    for, where they alternate. In a loop those of a disturbance come to it. So many
+    poles are known to be `n_at_zero`: estimates of these may grow.
     """
     if integrates(local) and combine == "average":
         raise ValueError(
@@ -138,7 +140,11 @@ def identify_point(
         return _averaged(dict(each), experiments, discretization, advice, efficient)
     fit = _fit_at_most if most else _fit_local
     pooled = fit(local, experiments, sampling_time)
-    return _pooled(pooled, experiments, discretization, advice, efficient, deviate)
+    longest = sampling_time * max(len(e.inputs) for e in experiments)
+    about_zero = AboutZero(n_at_zero, 1.0 / longest)
+    return _pooled(
+        pooled, experiments, discretization, advice, efficient, deviate, about_zero
+    )
 
 
 def _pooled(
@@ -148,6 +154,7 @@ def _pooled(
     advice: str,
     efficient: bool,
     deviate: bool,
+    about_zero: AboutZero,
 ) -> LocalModel:
     """That of one fit of all experiments of a point; options as in `identify_point`."""
     pairs = _deviated(fitted) if deviate else []
@@ -155,7 +162,8 @@ def _pooled(
         advice = _HELD + advice
     rates = getattr(fitted, "rates_", None)
     if rates is None:
-        lti = _continuous(fitted.lti_, discretization, advice).balance()
+        lti = _continuous(fitted.lti_, discretization, advice, about_zero)
+        lti = lti.balance() if lti.is_stable else lti
     else:  # stable but for the integrators
         _continuous(rates.lti_, discretization, advice)
         with collected():  # said of the rates
@@ -627,10 +635,32 @@ def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> str:
     )
 
 
-def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
+class AboutZero(NamedTuple):
+    """Poles that are known to be at zero: their number, and how near estimates are."""
+
+    n_poles: int = 0
+    rate: float = 0.0  # 1/s
+
+    def others(self, poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Poles of a model without estimates of these."""
+        poles = poles[np.argsort(np.abs(poles))]
+        far = np.abs(poles) > self.rate
+        far[self.n_poles :] = True
+        return poles[far]
+
+
+_NONE = AboutZero()
+
+
+def _continuous(
+    model: StateSpace,
+    discretization: str,
+    advice: str,
+    about_zero: AboutZero = _NONE,
+) -> StateSpace:
     with collected():  # said below
         lti = model.to_continuous(discretization)
-    if not lti.is_stable:
+    if not lti.is_stable and (about_zero.others(lti.poles()).real >= 0.0).any():
         worst = lti.poles()[np.argmax(lti.poles().real)]
         advice = _integrating_outputs(lti) + advice
         raise ValueError(
