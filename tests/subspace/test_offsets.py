@@ -352,6 +352,20 @@ def test_constants_are_seen_through_noise_of_long_memory(seed, offset):
     assert (model.order_, model.offset_) == (1, offset)
 
 
+@pytest.mark.parametrize("level", [0.3, 5.0, -300.0])
+def test_a_level_is_no_drift(rng, level):
+    u = rng.choice([-1.0, 1.0], (150, 1)).repeat(10, axis=0)
+    y = StateSpace([[0.9]], [[0.1]], [[1.0]], sampling_time=1.0).simulate(u)
+    y = y + 0.03 * rng.standard_normal(y.shape)
+    known = SubspaceLTI(1).fit(u, y + level)._evidence
+    assert known.free.n_trend == 1 and constants.chance_of_trend(known) < 1e-6
+    assert not constants.drifts_off(known.one_step)
+    drift = np.linspace(-0.1, 0.1, len(y))[:, None]
+    options = {"offset": "constant", "method": "po-moesp"}
+    slow = SubspaceLTI(1, **options).fit(u, y + level + drift)._evidence
+    assert constants.drifts_off(slow.one_step)
+
+
 def test_a_model_that_grows_beyond_all_squares_has_no_beginning(rng):
     u = rng.standard_normal((400, 1))
     y = lti_response(*(np.eye(1) * k for k in (0.9, 1.0, 1.0, 0.0)), u, np.zeros(1))

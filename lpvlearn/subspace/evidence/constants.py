@@ -430,12 +430,12 @@ def chance_of_trend(
         regression = jacobian_regression(R, model, driven, free)
         beside = free.n_own(len(model.A)) - len(whole.y)
         part = project_out(regression, beside)
-        if evidence.levels is not None:
+        if evidence.levels is not None and n_trend == 1:
             part[:, -1] += part[:, : len(whole.y)] @ evidence.levels[k]
         parts.append(part)
         error = whole.y.T - lti_response(*model[:4], whole.u.T, x0)
         errors.append(error - error.mean(axis=0))
-    return _chance(parts, errors, equal, evidence.levels is not None)
+    return _chance(parts, errors, equal, evidence.free.n_trend >= n_trend)
 
 
 def _chance(
@@ -443,7 +443,7 @@ def _chance(
 ) -> float:
     """As `chance_of_trend`, from regressions ``[constants, Jacobian, error]``.
 
-    `freed` errors are of a model with constants.
+    `freed` errors are of a model that has them.
     """
     ny, n_samples = errors[0].shape[1], sum(map(len, errors))
     rows = np.vstack(parts)
