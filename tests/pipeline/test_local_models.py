@@ -160,6 +160,42 @@ def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
         identify_point(local, [loop_record(0, 1.1)], **options)
 
 
+def test_a_plant_that_grows_is_no_integrator():
+    """Of one state, which has no other to be compared with."""
+    options = {"sampling_time": STEP, "combine": "pool", "discretization": "zoh"}
+    u = np.random.default_rng(0).standard_normal((300, 1))
+    plant = StateSpace(1.05, 1.0, 1.0, None, STEP)
+    run = Experiment(0, np.arange(300), u, plant.simulate(u))
+    with (
+        pytest.warns(UserWarning, match="unstable"),
+        pytest.raises(ValueError, match="must be stable") as refused,
+    ):
+        identify_point(SubspaceLTI(1), [run], **options)
+    assert "integrate" not in str(refused.value)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-2])
+def test_a_structure_may_integrate_twice(noise):
+    """Estimates of the poles grow at some points, and nobody has to name the output."""
+    rng = np.random.default_rng(1)
+    structure = GrayBoxStructure.from_template([[0, 1], [0, 0]], [[0], ["b"]], [[1, 0]])
+    runs, truth = [], 1.0 + np.array([0.0, 1.0, 2.0])
+    for b in truth:
+        u = rng.choice([-1.0, 1.0], (60, 1)).repeat(10, axis=0)
+        y = structure.model([b]).simulate(u, sampling_time=STEP)
+        y += noise * y.std() * rng.standard_normal(y.shape)
+        runs.append((u, b, y))
+    X, y = from_trajectories(runs, sampling_time=STEP)
+    model = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(structure),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    ).fit(X, y)
+    np.testing.assert_allclose(model.parameters_["b"], truth, rtol=10.0 * noise)
+    assert model.score(X, y) > 1.0 - 2.0 * noise
+
+
 def test_deviations_are_unknown_where_one_has_no_continuous_time():
     lag, other, still = (StateSpace(a, 1.0, 1.0, 0.0, STEP) for a in (0.5, 0.6, 0.0))
     found = LocalModel(lag.to_continuous(), 1, None, pairs=[(lag, other)])

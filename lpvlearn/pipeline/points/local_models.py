@@ -16,7 +16,7 @@ from sklearn.base import clone
 
 from ...data.experiments import ROLES, Experiment, as_table
 from ...data.preparation import DETRENDS
-from ...exceptions import Told, collected, retold, warn
+from ...exceptions import Told, collected, retold, take_back, warn
 from ...lpv.alignment import rotation_to
 from ...models.statespace import (
     ModelPair,
@@ -48,6 +48,10 @@ _STANDING = 0.05
 # One that much slower may be an integrator, known by samples that are not many; the
 # share by which it may decay in a record.
 _ABOUT_ZERO, _HARDLY = 0.25, 0.05
+_GROWN = 3.0  # time constants per record, up to which one that grows may be one
+
+# What is told of modes that do not decay, where that is known of them
+_OF_LASTING = ("decay", "pole", "border")
 
 # States that a disturbance may have beside those of a structure: two resonances, or a
 # resonance and two drifts.
@@ -132,18 +136,19 @@ def identify_point(
             "with integrators cannot be balanced. Got 'average'."
         )
     advice = _look_at_outputs(experiments, local)
+    longest = sampling_time * max(len(e.inputs) for e in experiments)
+    about_zero = AboutZero(n_at_zero, 1.0 / longest)
     labels = labels_of(experiments)
     if combine == "average" and len(labels) > 1:
         runs = [[e for e in experiments if e.label == label] for label in labels]
         alike = _fit_alike_at_most if most else _fit_alike
         each = zip(labels, alike(local, runs, sampling_time), strict=True)
-        return _averaged(dict(each), experiments, discretization, advice, efficient)
+        known = experiments, discretization, advice, efficient
+        return _averaged(dict(each), *known, about_zero)
     fit = _fit_at_most if most else _fit_local
     pooled = fit(local, experiments, sampling_time)
-    longest = sampling_time * max(len(e.inputs) for e in experiments)
-    about_zero = AboutZero(n_at_zero, 1.0 / longest)
     return _pooled(
-        pooled, experiments, discretization, advice, efficient, deviate, about_zero
+        pooled, experiments, discretization, advice, efficient, about_zero, deviate
     )
 
 
@@ -153,8 +158,8 @@ def _pooled(
     discretization: str,
     advice: str,
     efficient: bool,
-    deviate: bool,
     about_zero: AboutZero,
+    deviate: bool,
 ) -> LocalModel:
     """That of one fit of all experiments of a point; options as in `identify_point`."""
     pairs = _deviated(fitted) if deviate else []
@@ -164,8 +169,11 @@ def _pooled(
     if rates is None:
         lti = _continuous(fitted.lti_, discretization, advice, about_zero)
         lti = lti.balance() if lti.is_stable else lti
+        if about_zero.are_all_that_last(lti.poles()):
+            for kind in _OF_LASTING:
+                take_back(kind)
     else:  # stable but for the integrators
-        _continuous(rates.lti_, discretization, advice)
+        _continuous(rates.lti_, discretization, advice, _NONE)
         with collected():  # said of the rates
             lti = fitted.lti_.to_continuous(discretization)
     found = LocalModel(
@@ -190,6 +198,7 @@ def _averaged(
     discretization: str,
     advice: str,
     efficient: bool,
+    about_zero: AboutZero,
 ) -> LocalModel:
     """The mean of fits of the realisations of a point, by label.
 
@@ -198,12 +207,13 @@ def _averaged(
     models, failures = [], []
     kept: list[Any] = []
     estimates: list[Estimate] = []
+    none_at_zero = about_zero._replace(n_poles=0)  # what grows cannot be balanced
     for label, own in fitted.items():
         if not kept and _from_closed_loop(own):
             advice = _HELD + advice
         model, pairs = own.lti_, _deviated(own) if efficient else []
         try:
-            models.append(_continuous(model, discretization, advice))
+            models.append(_continuous(model, discretization, advice, none_at_zero))
             estimates.append(_in_own_time(model, pairs, discretization))
             kept.append(own)
         except ValueError as error:
@@ -648,21 +658,23 @@ class AboutZero(NamedTuple):
         far[self.n_poles :] = True
         return poles[far]
 
+    def are_all_that_last(self, poles: NDArray[np.complex128]) -> bool:
+        """Whether a model has estimates of these, and all others decay."""
+        others = self.others(poles)
+        return len(others) < len(poles) and bool((others.real < -self.rate).all())
+
 
 _NONE = AboutZero()
 
 
 def _continuous(
-    model: StateSpace,
-    discretization: str,
-    advice: str,
-    about_zero: AboutZero = _NONE,
+    model: StateSpace, discretization: str, advice: str, about_zero: AboutZero
 ) -> StateSpace:
     with collected():  # said below
         lti = model.to_continuous(discretization)
     if not lti.is_stable and (about_zero.others(lti.poles()).real >= 0.0).any():
         worst = lti.poles()[np.argmax(lti.poles().real)]
-        advice = _integrating_outputs(lti) + advice
+        advice = _integrating_outputs(lti, _GROWN * about_zero.rate) + advice
         raise ValueError(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
             "local=SubspaceLTI(offset='linear') if the outputs drift, "
@@ -682,7 +694,7 @@ def _continuous(
     return lti
 
 
-def _integrating_places(lti: StateSpace, rate: float = np.inf) -> list[int]:
+def _integrating_places(lti: StateSpace, rate: float) -> list[int]:
     """Which outputs integrate, where the only slow pole is about zero.
 
     Nearer to it than all others, and than a `rate`, 1/s. It is that of the outputs that
@@ -722,9 +734,9 @@ def tell_of_integrators(
         )
 
 
-def _integrating_outputs(lti: StateSpace) -> str:
-    """What to do about outputs that integrate, if there are any."""
-    places = _integrating_places(lti)
+def _integrating_outputs(lti: StateSpace, rate: float) -> str:
+    """What to do about outputs that integrate, if there are any, up to a `rate`."""
+    places = _integrating_places(lti, rate)
     if not places:
         return ""
     return (
