@@ -364,7 +364,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     f"to either side of it. Got {type(estimate).__name__}."
                 )
         problem = self._problem(model)
-        given = [problem.structure.check_params(s) for s in starts]
+        given = [problem.structure.check_params(s, name="starts") for s in starts]
         if not flag("search", search) and not given:
             raise ValueError(
                 "`starts` must hold parameters where `search` is False: nothing else "
@@ -493,7 +493,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         self._check_options()
         problem = self._problem(model)
-        fit = problem.fit(problem.structure.check_params(params))
+        fit = problem.fit(problem.structure.check_params(params, name="params"))
         return np.inf if fit is None else fit.relative_error
 
     def interchanged(self, places: ArrayLike) -> GrayBoxRestructurer:

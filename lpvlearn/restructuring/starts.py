@@ -110,7 +110,9 @@ def search(
     further candidates may be `given`, or all of them. A relative error of at most
     `enough` is the black box's own.
     """
-    guess = None if isinstance(init, str) else problem.structure.check_params(init)
+    guess = None
+    if not isinstance(init, str):
+        guess = problem.structure.check_params(init, name="init")
     for share in (1.0, _LEAST_MARGIN):
         problem = replace(problem, margin=share * problem.margin)
         if only_given:

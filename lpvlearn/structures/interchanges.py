@@ -134,7 +134,7 @@ def known_before(structure: GrayBoxStructure, init: Any) -> Array:
     `init` is that of `GrayBoxRestructurer`: parameters, or how to find some.
     """
     if init is not None and not isinstance(init, str):
-        return structure.check_params(init)
+        return structure.check_params(init, name="init")
     ranged = ~np.isnan(structure.ranges[0])
     known = ranged | (structure.initial is not None)
     guess = np.where(ranged, structure.ranges.mean(0), structure.reference)

@@ -739,12 +739,16 @@ class GrayBoxStructure(VersionedPickle):
         )
         return np.clip(np.where(known, drawn, around), self.lower, self.upper)
 
-    def check_params(self, theta: ArrayLike | Mapping[str, float]) -> Array:
+    def check_params(
+        self, theta: ArrayLike | Mapping[str, float], *, name: str = "theta"
+    ) -> Array:
         """`theta` as a finite vector.
 
         Parameters
         ----------
         theta : array-like of shape (n_params,) or mapping from name to value
+        name : str, default="theta"
+            How messages call it.
 
         Returns
         -------
@@ -759,18 +763,18 @@ class GrayBoxStructure(VersionedPickle):
             if set(theta) != set(self.parameter_names):
                 wrong = sorted(set(theta) ^ set(self.parameter_names), key=str)
                 raise ValueError(
-                    "`theta` must have a value for each name of the structure. Got "
+                    f"`{name}` must have a value for each name of the structure. Got "
                     f"missing or unknown ones: {', '.join(map(str, wrong))}."
                 )
-            theta = [theta[name] for name in self.parameter_names]
-        vector = real_array("theta", theta).reshape(-1)
+            theta = [theta[of] for of in self.parameter_names]
+        vector = real_array(name, theta).reshape(-1)
         if vector.shape != (self.n_params,) or not np.isfinite(vector).all():
             some = ", ".join(self.parameter_names[:4])
             raise ValueError(
-                f"`theta` must be {self.n_params} finite values "
+                f"`{name}` must be {self.n_params} finite values "
                 f"({some}{', ...' if self.n_params > 4 else ''}). Got {vector}."
             )
-        return squarable("theta", vector)
+        return squarable(name, vector)
 
     @property
     def reference(self) -> Array:

@@ -445,7 +445,7 @@ ERRORS = [
     ),
     (
         lambda: GrayBoxRestructurer(spring_structure(), init=[1.0]).fit_model(GOOD),
-        r"`theta` must be 3 finite values \(b, c, k",
+        r"`init` must be 3 finite values \(b, c, k",
     ),
     (
         lambda: GrayBoxRestructurer(frequency_weight=(3, 1)).fit_model(GOOD),

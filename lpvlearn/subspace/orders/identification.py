@@ -94,7 +94,7 @@ class Settings(NamedTuple):
 
         >>> Settings(Freedom(np.ones((1, 1), bool))).check_size([900], 9, 5)
         Traceback (most recent call last):
-        ValueError: `order` must be at most 4 for 900 samples and horizon 5. Got 9.
+        ValueError: `order` must be at most 4 ... horizon 5. Got 9. Use horizon='auto'.
         """
         longest = self.max_horizon(lengths)
         if order is None and self.orders:
@@ -111,7 +111,8 @@ class Settings(NamedTuple):
         if order is not None and order > highest:
             raise ValueError(
                 f"`order` must be at most {highest} for {sum(lengths)} samples and "
-                f"horizon {used}. Got {order}."
+                f"horizon {used}. Got {order}. "
+                + ("Use more samples." if horizon is None else "Use horizon='auto'.")
             )
 
 
