@@ -337,13 +337,14 @@ pd.DataFrame(
 # Integrators and undamped oscillators
 # ------------------------------------
 # A structure that has a pole at zero for all parameters, as a position has by ``x1' =
-# x2``, shares it with the black box. The distance of two integrators is infinite
-# unless their gains agree: both are divided by it, and the error is weighted by
-# ``s / (s + c)``, which compares gains at low frequencies. An oscillator without
-# damping, as a liquid that sloshes at a known frequency ``w0``, is shared likewise: by
-# rows ``[0, 1]`` and ``[-w0**2, 0]`` of fixed entries, and a weight that is zero at
-# ``w0``. ``known_poles=[1j * w0, -1j * w0]`` names such poles, and refuses a structure
-# that does not have them.
+# x2``, shares it with the black box. The distance of two integrators is infinite unless
+# their gains agree: both are divided by it, and the error is weighted by ``s / (s +
+# c)``, which compares gains at low frequencies. Poles that a record puts near zero,
+# growing ones too, are estimates of it, several of a chain as ``x1' = x2, x2' = b u``.
+# An oscillator without damping, as a liquid that sloshes at a known frequency ``w0``,
+# is shared likewise: by rows ``[0, 1]`` and ``[-w0**2, 0]`` of fixed entries, and a
+# weight that is zero at ``w0``. ``known_poles=[1j * w0, -1j * w0]`` names such poles,
+# and refuses a structure that does not have them.
 #
 # Large problems
 # --------------
