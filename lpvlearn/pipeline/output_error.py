@@ -6,13 +6,14 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.experiments import NO_TIME, Experiment
+from ..data.experiments import NO_TIME, Experiment, are_beginnings
 from ..data.operating_points import check_outputs, without_spikes
 from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
@@ -290,7 +291,8 @@ class OutputErrorLPV(ScheduledEstimator):
         growth = growth_rates(self.lpv_, levels, longest, _UNSEEN)
         # what grows, or hardly decays, no inputs hold
         if not self.lpv_.steady_start and (growth < 0.0).all():
-            records = [record_of(e, dt) for e in experiments]
+            begun = compress(experiments, are_beginnings(experiments))
+            records = [record_of(e, dt) for e in begun]
             steady = begins_held(self.lpv_, records, own)
             self.lpv_ = replace(self.lpv_, steady_start=steady)
         return self

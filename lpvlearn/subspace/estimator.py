@@ -614,8 +614,7 @@ class SubspaceLTI(ScoredFromRest):
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
         self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
-        here = self._simulator()._replace(lti=self.lti_.with_input_delay(0))
-        self.begun_state_ = here.begun_state(experiments)
+        self._take_beginning(experiments)
         if telling.silent:
             return fitted
         warn_about(fitted, telling)
@@ -659,6 +658,7 @@ class SubspaceLTI(ScoredFromRest):
         self.offset_ = inner.offset_
         offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
         self._take_offsets(offsets, step)
+        self._take_beginning(experiments)
         return self
 
     def _of_sums(self, experiments: Sequence[Experiment], rates: Self) -> Self:
@@ -908,7 +908,13 @@ class SubspaceLTI(ScoredFromRest):
         self.input_offset_, self.output_offset_ = offsets.inputs, offsets.outputs
         self.output_drift_ = offsets.drifts / step
         # But for experiments that are all there
-        self.steady_start_, self.begun_state_ = False, None
+        self.steady_start_ = False
+        self.begun_state_: Array | None = None
+
+    def _take_beginning(self, experiments: Sequence[Experiment]) -> None:
+        """Where experiments begin, if that is far from rest."""
+        here = self._simulator()._replace(lti=self.lti_.with_input_delay(0))
+        self.begun_state_ = here.begun_state(experiments)
 
     def _name(self, inputs: Any, outputs: Any) -> None:
         """Let the model know the names of the columns, where they have some."""

@@ -17,7 +17,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from sklearn.utils.validation import check_is_fitted
 
 from lpvlearn import from_trajectories
-from lpvlearn.data.experiments import read_experiments
+from lpvlearn.data.experiments import Experiment, are_beginnings, read_experiments
 from lpvlearn.data.tables import read_outputs
 
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "t"}
@@ -392,3 +392,9 @@ def test_a_tuple_that_is_a_column_is_one_column():
     assert read_outputs(y)[1] == [("out", "y")]
     (run,) = read(X, y, inputs=(("sig", "u"), ("sig", "kap")))
     assert run.input_names == (("sig", "u"), ("sig", "kap"))
+
+
+def test_parts_after_a_gap_begin_no_experiment():
+    rows = np.arange(3)
+    parts = [Experiment(label, rows, rows[:, None]) for label in ("a", "a", "b", "a")]
+    assert are_beginnings(parts) == [True, False, True, False]

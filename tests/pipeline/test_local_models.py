@@ -196,6 +196,29 @@ def test_a_structure_may_integrate_twice(noise):
     assert model.score(X, y) > 1.0 - 2.0 * noise
 
 
+def test_positions_of_all_points_begin_where_those_of_the_fit_did():
+    """At one place, whichever the scheduling variable: means of what points tell."""
+    rng = np.random.default_rng(0)
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [0, "-d"]], [[0], ["b"]], [[1, 0]]
+    )
+    runs = []
+    for d, level in zip([1.0, 2.0, 3.0], [49.0, 50.0, 51.0], strict=True):
+        u = rng.choice([-1.0, 1.0], (60, 1)).repeat(10, axis=0)
+        y = level + structure.model([3.0, d]).simulate(u, sampling_time=STEP)
+        runs.append((u, d, y + 1e-3 * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=STEP)
+    model = LocalLPVPipeline(
+        SubspaceLTI(integrating=True),
+        GrayBoxRestructurer(structure),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    ).fit(X, y)
+    begins = model.predict(X).reshape(3, -1)[:, 0]
+    np.testing.assert_allclose(begins, 50.0, atol=0.2)
+
+
 def test_deviations_are_unknown_where_one_has_no_continuous_time():
     lag, other, still = (StateSpace(a, 1.0, 1.0, 0.0, STEP) for a in (0.5, 0.6, 0.0))
     found = LocalModel(lag.to_continuous(), 1, None, pairs=[(lag, other)])

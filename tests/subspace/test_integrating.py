@@ -13,6 +13,7 @@ from lpvlearn import (
     LocalLPVPipeline,
     StateSpace,
     SubspaceLTI,
+    bft_score,
     from_trajectories,
 )
 from lpvlearn.models.statespace import DEVIATION
@@ -178,9 +179,26 @@ def test_integrators_are_offered_by_name():
     drifting = StateSpace(
         [[1e-4, 1.0], [0.0, -3.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]
     )
-    assert "SubspaceLTI(integrating=[1])" in _integrating_outputs(drifting)
+    assert "SubspaceLTI(integrating=[1])" in _integrating_outputs(drifting, 0.01)
+    assert _integrating_outputs(drifting, 1e-5) == ""  # a long record would show it
     growing = StateSpace([[2.0, 1.0], [0.0, -3.0]], [[0.0], [1.0]], [[1.0, 0.0]])
-    assert _integrating_outputs(growing) == ""
+    assert _integrating_outputs(growing, np.inf) == ""
+
+
+def test_positions_begin_where_those_of_the_fit_did():
+    """Of a rate that rests nothing tells where: three experiments begin at 50."""
+    rng = np.random.default_rng(0)
+    servo = StateSpace([[0.0, 1.0], [0.0, -2.0]], [[0.0], [3.0]], [[1.0, 0.0]])
+    u = rng.choice([-1.0, 1.0], (4, 60, 1)).repeat(10, axis=1)
+    y = 50.0 + np.array([servo.simulate(run, sampling_time=STEP) for run in u])
+    y += 2e-4 * rng.standard_normal(y.shape)
+    X = pd.DataFrame({"u": u[:3].ravel(), "run": np.repeat(range(3), 600)})
+    options = {"integrating": True, "experiment": "run", "sampling_time": STEP}
+    model = SubspaceLTI(1, **options).fit(X, y[:3].reshape(-1, 1))
+    fresh = pd.DataFrame({"u": u[3].ravel(), "run": 0})
+    assert bft_score(y[3], model.predict(fresh)) > 99.0
+    level = SubspaceLTI(1, **options).fit(X, y[:3].reshape(-1, 1) - 50.0)
+    assert level.begun_state_ is None
 
 
 def test_the_rates_of_a_loop_keep_what_acts_at_once():

@@ -401,12 +401,15 @@ def offsets_of_points(
 
     And the sizes of the motions of inputs and outputs.
     """
-    if not any(model.n_trend and model.rest for model in found.local):
+    local = found.local
+    if not any((model.n_trend or model.integrating) and model.rest for model in local):
         return None
     runs = [run for group in found.points.experiments for run in group]
     (u, u_scale), (y, y_scale) = motions(runs)
-    rest = [model.rest or (np.zeros_like(u), np.zeros_like(y)) for model in found.local]
+    rest = [model.rest or (np.zeros_like(u), np.zeros_like(y)) for model in local]
     inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
+    places = local[0].integrating  # where these stand no scheduling variable moves
+    outputs[:, places] = outputs[:, places].mean(axis=0)
     scales = (u_scale, y_scale)
     kappa = found.points.kappa
     known = found.models, kappa, inputs, outputs, scales

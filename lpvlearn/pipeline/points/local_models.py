@@ -318,10 +318,11 @@ def _equilibrium(
     looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
     if not looked or not hasattr(first, "resting_point"):
         return None
-    if integrates(first) and first.offset_ is None:
-        return None
     known = [own.resting_point(begun=True) for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
+    if integrates(first):
+        begun = _beginning(fitted)
+        return None if first.offset_ is None and not begun.any() else (u0, y0 + begun)
     longest = max(len(e.inputs) for e in experiments)
     (u, u_scale), (y, y_scale) = motions(_without_drifts(fitted, experiments))
     gain = lti.dc_gain()
@@ -335,6 +336,17 @@ def _equilibrium(
         np.concatenate([(u - u0) / u_scale, (y - y0) / y_scale]),
     )
     return u0 + step, y0 + gain @ step
+
+
+def _beginning(fitted: Sequence[Any]) -> Array:
+    """Where outputs that integrate begin, mean of all; zero where that is near rest."""
+    states = [own.begun_state_ for own in fitted]
+    outputs = [
+        own.lti_.C @ (np.zeros(own.order_) if x is None else x)
+        for own, x in zip(fitted, states, strict=True)
+    ]
+    flags = np.isin(np.arange(len(outputs[0])), _integrating(fitted[0]))
+    return np.where(flags, np.mean(outputs, axis=0), 0.0)
 
 
 def _without_drifts(
