@@ -456,6 +456,16 @@ def test_step_tests_begin_where_they_stood(level, delay):
     np.testing.assert_allclose(known, model.predict(u), atol=0.1)
 
 
+def test_few_samples_of_many_channels_are_told(rng):
+    """A horizon of two, which states need, takes 35 samples of eight channels."""
+    u, modes = rng.standard_normal((31, 3)), rng.uniform(0.5, 0.9, 5)
+    plant = StateSpace(np.diag(modes), rng.standard_normal((5, 3)), np.eye(5), None, 1)
+    y = plant.simulate(u)
+    with pytest.warns(UserWarning, match=r"few samples \(31\).* each output alone"):
+        assert SubspaceLTI().fit(u, y).order_ == 0
+    assert SubspaceLTI().fit(u, y[:, :1]).order_ > 0
+
+
 def test_runs_after_a_gap_are_no_beginnings():
     """A run that begins in motion may do so where inputs were held for a while."""
     rng = np.random.default_rng(0)

@@ -27,6 +27,7 @@ from ..evidence.rounding import rounded_outputs
 from ..evidence.spikes import find_spikes
 from ..evidence.statistics import OPEN, Evidence
 from ..fits.local_fit import LocalFit
+from ..orders.identification import Settings
 from ..orders.selection import MAX_ORDER
 from ..samples.records import thinned
 from ..simulation_error.held_out import HeldOut
@@ -193,8 +194,19 @@ def _warn_of_error(
                 ", or method='pbsid' where noise moves the states of the plant, as "
                 "wind and roads do"
             )
+        free, records = fitted.evidence.free, fitted.scaled.records
+        n_samples = [record.n_samples for record in records]
         # Glitches hide whatever else there is.
-        if not bent and not _tells_of_glitches(fitted, telling):
+        if bent or _tells_of_glitches(fitted, telling):
+            return
+        if fitted.method != "pbsid" and Settings(free).max_horizon(n_samples) < 2:
+            telling.once(
+                "useless",
+                f"{_next_to_nothing(fitted)} So few samples ({max(n_samples)}) carry "
+                f"no states beside {sum(free.direct.shape)} inputs and outputs. Give a "
+                "longer record, or identify each output alone.",
+            )
+        else:
             telling.once(
                 "useless",
                 f"{_next_to_nothing(fitted)} Try a longer `horizon` or {other}, and "
