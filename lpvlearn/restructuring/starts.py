@@ -159,11 +159,11 @@ def search(
             * (problem.system.dt is not None)
         )
     raise ValueError(
-        "no stable starting point was found for `structure`. Give `init`, a vector of "
-        "parameters of a stable model, bounds or ranges that tell signs and sizes "
-        f"(with_bounds, with_ranges), or raise `n_starts` (got {n_starts})."
-        + DISCRETE_BOX
-        * (problem.system.dt is not None)
+        "no stable starting point was found for `structure`. Check the signs of its "
+        "entries: one that is wrong may make it unstable for all parameters. Else give "
+        "`init`, a vector of parameters of a stable model, bounds or ranges that tell "
+        "signs and sizes (with_bounds, with_ranges), or raise `n_starts` (got "
+        f"{n_starts})." + DISCRETE_BOX * (problem.system.dt is not None)
     )
 
 
