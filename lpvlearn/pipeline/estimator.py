@@ -81,7 +81,7 @@ from .points.local_models import (
     is_left,
     tell_of_integrators,
 )
-from .points.mislabelled import tell_of_mislabelled
+from .points.mislabelled import tell_of_exchanged_values, tell_of_mislabelled
 from .refining.coefficients import known_coefficients, local_covariance, refine_model
 from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along
@@ -847,6 +847,8 @@ list, default=None
         repeated = (len(kappa) - n_places) * found.theta.shape[1]
         dof = getattr(form, "degrees_of_freedom_", np.inf)
         saturated = not moving and dof <= repeated
+        if isinstance(form, SplineLPV) and self.restructurers_:
+            tell_of_exchanged_values(kappa, found.theta, found.covariance)
         if isinstance(form, SplineLPV) or (saturated and n_places > 2):
             tell_unforeseen(
                 self.lpv_,

@@ -6,7 +6,10 @@ import pytest
 from lpvlearn import StateSpace
 from lpvlearn.exceptions import collected
 from lpvlearn.pipeline.points.local_models import LocalModel
-from lpvlearn.pipeline.points.mislabelled import tell_of_mislabelled
+from lpvlearn.pipeline.points.mislabelled import (
+    tell_of_exchanged_values,
+    tell_of_mislabelled,
+)
 
 KAPPA = np.arange(4.0)[:, None]
 ONES = np.ones(4)
@@ -90,3 +93,42 @@ def test_laws_of_the_scheduling_are_none_of_these(law):
 def test_laws_that_overflow_far_from_the_points_are_laws():
     kappa = np.array([[0.0], [1e-3], [2e-3], [3.0]])
     assert said(oscillators(by_output=[1.0, 10.0, 100.0, 1.0]), kappa) == ""
+
+
+PLACES = np.linspace(0.0, 1.0, 6)[:, None]
+
+
+def parameters(law, noise=1e-3):
+    """Those of a law and their covariance, and a constant beside it."""
+    rng = np.random.default_rng(0)
+    theta = np.column_stack([law(PLACES[:, 0]), np.ones(6)])
+    theta += noise * rng.standard_normal(theta.shape)
+    return theta, np.broadcast_to(noise**2 * np.eye(2), (6, 2, 2))
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (0, 5), (2, 5)])
+@pytest.mark.parametrize("law", [lambda k: 1.0 + k, lambda k: 3.0 - k - k**2])
+def test_points_that_have_the_values_of_one_another_are_named(law, pair):
+    theta, covariance = parameters(law)
+    kappa = PLACES.copy()
+    kappa[list(pair)] = kappa[list(pair[::-1])]
+    words = f"point {pair[0]} .* and operating point {pair[1]} .* look exchanged"
+    with pytest.warns(UserWarning, match=words):
+        tell_of_exchanged_values(kappa, theta, covariance)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda k: 1.0 + k,
+        lambda k: np.abs(k - 0.5),
+        lambda k: np.where(k > 0.5, 2.0, 1.0),
+        lambda k: np.sin(9.0 * k),
+        lambda k: 1.0 / (0.1 + k),
+    ],
+)
+def test_laws_that_bend_are_no_exchange(law):
+    theta, covariance = parameters(law)
+    tell_of_exchanged_values(PLACES, theta, covariance)
+    unknown = np.full_like(covariance, np.nan)
+    tell_of_exchanged_values(PLACES[::-1], theta, unknown)

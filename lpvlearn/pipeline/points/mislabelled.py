@@ -1,11 +1,13 @@
 """Operating points where a channel has another unit, sign or place than elsewhere.
 
 That leaves its mark on a response: a constant ratio to what the other points foresee.
+And points that have the scheduling values of one another, which parameters tell.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import suppress
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
@@ -13,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...exceptions import warn
+from ...lpv.polynomial import PolynomialLPV
+from ...lpv.weighting import noise_explains
 from ...models.scheduling_range import in_range_of_points
 from ..running.runner import place_of
 from .left_out import forgetting, forgotten
@@ -34,6 +38,10 @@ _PART, _ALIKE, _LEFT = 0.7, 0.35, 0.4
 _FAR, _RANGE = 5.0, 10.0
 
 _OTHERS = 3  # points that tell how much a channel varies
+
+# Degrees of a polynomial that meets parameters within their noise where two points, of
+# that many at most, are exchanged; and times its chi-square, at the least, as they are.
+_DEGREES, _MANY, _CLEARER = (1, 2), 15, 100.0
 
 _ROUND = 1.25  # from a power of ten, up to which a factor is told as that
 
@@ -75,6 +83,45 @@ def tell_of_mislabelled(
             "Give the record as the others are, or leave the point out, and fit again."
         )
     return bool(told)
+
+
+def tell_of_exchanged_values(kappa: Array, theta: Array, covariance: Array) -> None:
+    """Warn of two points that have the scheduling values of one another.
+
+    Where parameters `theta`, (n_points, n_params), of these `covariance` are met by a
+    low polynomial within their noise if two points are exchanged, far better than as
+    they are, and if no other two are.
+    """
+    n = len(kappa)
+    if n > _MANY or not np.isfinite(covariance).all():
+        return
+
+    def forms(places: NDArray[np.intp]) -> list[PolynomialLPV]:
+        found = []
+        for degree in _DEGREES:
+            with suppress(ValueError):  # the points are too few
+                form = PolynomialLPV(degree)
+                found.append(form.fit(kappa[places], theta, covariance=covariance))
+        # two values beside the coefficients of every parameter
+        return [f for f in found if f.degrees_of_freedom_ >= 2 * theta.shape[1]]
+
+    as_is = forms(np.arange(n))
+    if not as_is or any(map(noise_explains, as_is)):
+        return
+    most = min(form.chi2_ for form in as_is) / _CLEARER
+    found = []
+    for i, j in combinations(range(n), 2):
+        places = np.arange(n)
+        places[[i, j]] = j, i
+        if any(noise_explains(f) and f.chi2_ < most for f in forms(places)):
+            found.append((i, j))
+    if len(found) == 1:
+        first, second = (place_of(k, kappa) for k in found[0])
+        warn(
+            f"the records of {first} and {second} look exchanged: with the scheduling "
+            "values of one another all parameters follow a simple law within their "
+            "standard deviations, and as they stand by far not. Check which is which."
+        )
 
 
 def _responses(local: Sequence[LocalModel], longest: float) -> Complex:
