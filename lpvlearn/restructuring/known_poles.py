@@ -368,7 +368,7 @@ def _chained(model: Target, chain: Sequence[_Step]) -> Target | None:
 
     In states that are theirs, balanced for what changes at the rate c, and the others.
     Of outputs that do not show a part of it that is left out, as in `_snapped`. None
-    where the poles are no chain, or not as many as the steps divide out.
+    where the poles are no chain, not as many as the steps divide out, or not seen.
     """
     A, B, C = model.A, model.B, model.C
     count, pole, near = sum(s.n_directions for s in chain), chain[0].pole, chain[0].near
@@ -385,7 +385,9 @@ def _chained(model: Target, chain: Sequence[_Step]) -> Target | None:
         beside = solve_sylvester(R[:k, :k], -others, -R[:k, k:])
     Bs, Cs = Z.T @ B, C @ Z
     B, C = Bs[:k] - beside @ Bs[k:], Cs[:, :k]
-    T = _balancing(own - c * np.eye(k), B, C)
+    if not (B.any() and C.any()):
+        return None
+    T = _balancing(own - c * np.eye(k), B / np.abs(B).max(), C / np.abs(C).max())
     own = np.linalg.solve(T, own @ T)
     Q, number = _staircase(own, [step.n_directions for step in chain])
     later = number[:, None] < number

@@ -357,6 +357,18 @@ def test_poles_about_a_double_integrator_are_estimates_of_it(
     )
 
 
+@pytest.mark.parametrize("b", [0.0, 1e-200])
+def test_a_double_integrator_that_no_input_moves_is_told(b):
+    """Of an estimate of it: the states have no units of size one."""
+    A = [[1e-6, 1.0, 0.0], [0.0, -1e-6, 2.0], [0.0, 0.0, -3.0]]
+    structure = template(
+        [[0, 1, 0], [0, 0, "k"], [0, 0, "-a"]], [[0], [0], ["b"]], [[1, 0, 0]]
+    )
+    box = StateSpace(A, [[0.0], [0.0], [b]], [[1.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="a response that is not zero"):
+        GrayBoxRestructurer(structure).fit_model(box)
+
+
 @pytest.mark.parametrize("shift", [-0.01, 0.01, 0.01j, -0.01j])
 def test_a_pair_that_is_nearly_the_known_one_is_an_estimate_of_it(shift):
     truth = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})

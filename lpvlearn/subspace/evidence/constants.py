@@ -430,7 +430,7 @@ def chance_of_trend(
         regression = jacobian_regression(R, model, driven, free)
         beside = free.n_own(len(model.A)) - len(whole.y)
         part = project_out(regression, beside)
-        if evidence.levels is not None and n_trend == 1:
+        if evidence.levels is not None and n_trend == 1:  # which are of constants
             part[:, -1] += part[:, : len(whole.y)] @ evidence.levels[k]
         parts.append(part)
         error = whole.y.T - lti_response(*model[:4], whole.u.T, x0)
