@@ -246,8 +246,8 @@ def are_beginnings(experiments: Sequence[Experiment]) -> list[bool]:
 
     Parts have the label of their experiment, and are in the order of time.
     """
-    labels = [e.label for e in experiments]
-    return [labels.index(label) == k for k, label in enumerate(labels)]
+    first: dict[Hashable, int] = {}
+    return [first.setdefault(e.label, k) == k for k, e in enumerate(experiments)]
 
 
 def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:

@@ -43,12 +43,12 @@ from scipy.linalg import (
     null_space,
     qr,
     schur,
-    solve_continuous_lyapunov,
     solve_sylvester,
 )
 
 from ..structures.map import framed
 from ..structures.structure import GrayBoxStructure
+from ..systems.balancing import balancing_transformation
 from ..systems.response import pole_rates
 from ..validation import complex_array
 from .error_system import Target, frequency_grid, laplace_variable
@@ -226,19 +226,21 @@ def integrators(structure: GrayBoxStructure) -> int:
 
     The rates of outputs that integrate have one pole less of each.
     """
-    thetas = _drawn(structure)
-    if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
-        return 0
-    return _directions(_blocks(structure, thetas[0])[0], 0.0, _FIXED).shape[1]
+    return _directions(_integrating(structure), 0.0, _FIXED).shape[1]
 
 
 def poles_at_zero(structure: GrayBoxStructure) -> int:
     """How many poles at zero the structure has for all parameters, chains and all."""
+    A = _integrating(structure)
+    return len(A) - len(_without(A, 0.0))
+
+
+def _integrating(structure: GrayBoxStructure) -> Array:
+    """An A of a structure with a pole at zero for all parameters; empty without one."""
     thetas = _drawn(structure)
     if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
-        return 0
-    A = _blocks(structure, thetas[0])[0]
-    return len(A) - len(_without(A, 0.0))
+        return np.zeros((0, 0))
+    return _blocks(structure, thetas[0])[0]
 
 
 def hidden_integrators(structure: GrayBoxStructure) -> int:
@@ -354,6 +356,8 @@ def _without_part(
     model: Target, hidden: Flags, part: Array | Complex, step: _Step
 ) -> Target:
     """A model whose `hidden` outputs do not show a part of C, where that is little."""
+    if not hidden.any():
+        return model
     A, B, C = model.A, model.B, model.C
     c = step.near / _NEAR
     G = np.linalg.solve((step.pole + 1j * c) * np.eye(len(A)) - A, B)
@@ -370,30 +374,31 @@ def _chained(model: Target, chain: Sequence[_Step]) -> Target | None:
     Of outputs that do not show a part of it that is left out, as in `_snapped`. None
     where the poles are no chain, not as many as the steps divide out, or not seen.
     """
-    A, B, C = model.A, model.B, model.C
     count, pole, near = sum(s.n_directions for s in chain), chain[0].pole, chain[0].near
-    away = np.sort(_distances(np.linalg.eigvals(A).astype(complex), chain))
-    if len(chain) == 1 or pole.imag or not (away <= near).sum() == count:
+    if len(chain) == 1 or pole.imag or len(model.A) < count:
         return None
     p, c = pole.real, near / _NEAR
-    R, Z, k = schur(A, sort=lambda re, im=0.0: np.hypot(re - p, im) <= near)
-    if k != count:  # one at the border
+    R, Z, k = schur(model.A, sort=lambda re, im=0.0: np.hypot(re - p, im) <= near)
+    if k != count:
         return None
     own, others = R[:k, :k] - p * np.eye(k), R[k:, k:]
     beside = np.zeros((k, len(others)))
     if len(others):
         beside = solve_sylvester(R[:k, :k], -others, -R[:k, k:])
-    Bs, Cs = Z.T @ B, C @ Z
+    Bs, Cs = Z.T @ model.B, model.C @ Z
     B, C = Bs[:k] - beside @ Bs[k:], Cs[:, :k]
     if not (B.any() and C.any()):
         return None
-    T = _balancing(own - c * np.eye(k), B / np.abs(B).max(), C / np.abs(C).max())
-    own = np.linalg.solve(T, own @ T)
+    even = B / np.abs(B).max(), C / np.abs(C).max()  # a gain is none of the states
+    T = balancing_transformation(own - c * np.eye(k), *even, discrete=False)
+    if len(T.left) < k:
+        return None
+    own = T.left @ own @ T.right
     Q, number = _staircase(own, [step.n_directions for step in chain])
     later = number[:, None] < number
     A = block_diag(p * np.eye(k) + np.where(later, Q.T @ own @ Q, 0.0), others)
-    B = np.vstack([Q.T @ np.linalg.solve(T, B), Bs[k:]])
-    C = np.hstack([C @ T @ Q, Cs[:, :k] @ beside + Cs[:, k:]])
+    B = np.vstack([Q.T @ T.left @ B, Bs[k:]])
+    C = np.hstack([C @ T.right @ Q, Cs[:, :k] @ beside + Cs[:, k:]])
     model = Target(A, B, C, model.D, model.dt)
     shown = np.zeros(len(C), dtype=bool)
     for place, step in enumerate(chain):
@@ -414,16 +419,6 @@ def _distances(poles: Complex, chain: Sequence[_Step]) -> Array:
     if len(chain) > 1 and not pole.imag:
         alike = np.ones(len(poles), dtype=bool)
     return np.where(alike, np.abs(poles - pole), np.inf)
-
-
-def _balancing(A: Array, B: Array, C: Array) -> Array:
-    """States in which the inputs move a stable model as much as outputs show."""
-    reached = solve_continuous_lyapunov(A, -B @ B.T)
-    seen = solve_continuous_lyapunov(A.T, -C.T @ C)
-    some = _CLEAN * np.eye(len(A))
-    L = np.linalg.cholesky(reached + np.trace(reached) * some)
-    squares, U = np.linalg.eigh(L.T @ (seen + np.trace(seen) * some) @ L)
-    return np.asarray(L @ U * squares**-0.25)
 
 
 def _staircase(N: Array, counts: Sequence[int]) -> tuple[Array, NDArray[np.intp]]:

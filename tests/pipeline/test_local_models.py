@@ -26,6 +26,7 @@ from lpvlearn.pipeline.points.local_models import (
 from ..conftest import ROLES
 
 STEP = 0.1
+OF_TRAJECTORIES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
 
 
 def loop_record(seed, pole=0.9, n_samples=1500):
@@ -188,9 +189,7 @@ def test_a_structure_may_integrate_twice(noise):
     X, y = from_trajectories(runs, sampling_time=STEP)
     model = LocalLPVPipeline(
         restructurer=GrayBoxRestructurer(structure),
-        scheduling="kappa",
-        experiment="experiment",
-        time="time",
+        **OF_TRAJECTORIES,
     ).fit(X, y)
     np.testing.assert_allclose(model.parameters_["b"], truth, rtol=10.0 * noise)
     assert model.score(X, y) > 1.0 - 2.0 * noise
@@ -211,9 +210,7 @@ def test_positions_of_all_points_begin_where_those_of_the_fit_did():
     model = LocalLPVPipeline(
         SubspaceLTI(integrating=True),
         GrayBoxRestructurer(structure),
-        scheduling="kappa",
-        experiment="experiment",
-        time="time",
+        **OF_TRAJECTORIES,
     ).fit(X, y)
     begins = model.predict(X).reshape(3, -1)[:, 0]
     np.testing.assert_allclose(begins, 50.0, atol=0.2)
@@ -269,9 +266,7 @@ def test_a_bias_is_known_to_the_lpv_model(integrating):
     model = LocalLPVPipeline(
         SubspaceLTI(integrating=integrating),
         GrayBoxRestructurer(structure),
-        scheduling="kappa",
-        experiment="experiment",
-        time="time",
+        **OF_TRAJECTORIES,
     ).fit(X, y)
     np.testing.assert_allclose(model.report_["u0_u1"], -BIAS, atol=5e-3)
     error = truth - model.predict(sweep).reshape(truth.shape)

@@ -25,6 +25,7 @@ from ...models.statespace import (
     scaled,
 )
 from ...restructuring.minimise_covariance import Estimate
+from ...subspace.diagnosis.fit_warnings import OF_LASTING
 from ...subspace.evidence.constants import CERTAIN
 from ...subspace.fits.integrating import integrating_flags
 from ...systems.modes import lasting, n_changes
@@ -49,9 +50,6 @@ _STANDING = 0.05
 # share by which it may decay in a record.
 _ABOUT_ZERO, _HARDLY = 0.25, 0.05
 _GROWN = 3.0  # time constants per record, up to which one that grows may be one
-
-# What is told of modes that do not decay, where that is known of them
-_OF_LASTING = ("decay", "pole", "border")
 
 # States that a disturbance may have beside those of a structure: two resonances, or a
 # resonance and two drifts.
@@ -136,17 +134,18 @@ def identify_point(
             "with integrators cannot be balanced. Got 'average'."
         )
     advice = _look_at_outputs(experiments, local)
-    longest = sampling_time * max(len(e.inputs) for e in experiments)
-    about_zero = AboutZero(n_at_zero, 1.0 / longest)
+    rate = 1.0 / (sampling_time * max(len(e.inputs) for e in experiments))
     labels = labels_of(experiments)
     if combine == "average" and len(labels) > 1:
         runs = [[e for e in experiments if e.label == label] for label in labels]
         alike = _fit_alike_at_most if most else _fit_alike
         each = zip(labels, alike(local, runs, sampling_time), strict=True)
         known = experiments, discretization, advice, efficient
-        return _averaged(dict(each), *known, about_zero)
+        none_at_zero = AboutZero(0, rate)  # what grows cannot be balanced
+        return _averaged(dict(each), *known, none_at_zero)
     fit = _fit_at_most if most else _fit_local
     pooled = fit(local, experiments, sampling_time)
+    about_zero = AboutZero(n_at_zero, rate)
     return _pooled(
         pooled, experiments, discretization, advice, efficient, about_zero, deviate
     )
@@ -170,10 +169,10 @@ def _pooled(
         lti = _continuous(fitted.lti_, discretization, advice, about_zero)
         lti = lti.balance() if lti.is_stable else lti
         if about_zero.are_all_that_last(lti.poles()):
-            for kind in _OF_LASTING:
+            for kind in OF_LASTING:
                 take_back(kind)
     else:  # stable but for the integrators
-        _continuous(rates.lti_, discretization, advice, _NONE)
+        _continuous(rates.lti_, discretization, advice, AboutZero())
         with collected():  # said of the rates
             lti = fitted.lti_.to_continuous(discretization)
     found = LocalModel(
@@ -207,13 +206,12 @@ def _averaged(
     models, failures = [], []
     kept: list[Any] = []
     estimates: list[Estimate] = []
-    none_at_zero = about_zero._replace(n_poles=0)  # what grows cannot be balanced
     for label, own in fitted.items():
         if not kept and _from_closed_loop(own):
             advice = _HELD + advice
         model, pairs = own.lti_, _deviated(own) if efficient else []
         try:
-            models.append(_continuous(model, discretization, advice, none_at_zero))
+            models.append(_continuous(model, discretization, advice, about_zero))
             estimates.append(_in_own_time(model, pairs, discretization))
             kept.append(own)
         except ValueError as error:
@@ -674,9 +672,6 @@ class AboutZero(NamedTuple):
         """Whether a model has estimates of these, and all others decay."""
         others = self.others(poles)
         return len(others) < len(poles) and bool((others.real < -self.rate).all())
-
-
-_NONE = AboutZero()
 
 
 def _continuous(

@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 # What is told from tests that take as long as a fit
 TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack"}
 
+# What is told of modes that do not decay
+OF_LASTING = ("decay", "pole", "border")
+
 # What was told of that bends a response as well
 _BENDS = {"bent", "limit", "held", "dropouts", "input spikes", "lines"}
 
