@@ -480,7 +480,7 @@ STEPS = {
     ),
     "an unknown discretization": (
         lambda: fit(discretization="tusin"),
-        ["`discretization` must be 'zoh' or 'tustin'", "Got 'tusin'"],
+        ["`discretization` must be 'auto', 'zoh', 'foh' or 'tustin'", "Got 'tusin'"],
     ),
     "a number for the memory": (lambda: fit(memory=3), ["`memory` must be", "Got int"]),
     "a misspelt parameter of a step": (

@@ -19,7 +19,7 @@ from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
 from ..systems.beginnings import first_inputs, held_state, standing
-from ..systems.sampling import sample_zoh
+from ..systems.sampling import sample_foh, sample_zoh
 from ..systems.simulation import (
     delayed,
     estimate_initial_state,
@@ -36,6 +36,7 @@ from ..validation import (
     matrix,
     measured_samples,
     names_of,
+    one_of,
     place,
     positive_time,
     real_array,
@@ -112,6 +113,9 @@ class LPVStateSpace(VersionedPickle):
         Where a simulation begins whose inputs stand still at first and move later: at
         rest at the point of work, or, as step tests do, where its first inputs hold the
         model at the first scheduling value.
+    hold : {"zoh", "foh"}, default="zoh"
+        What inputs do between the samples of a simulation: they stay, or they go on
+        linearly to the next one. Scheduling and points of work stay.
 
     Attributes
     ----------
@@ -176,6 +180,7 @@ class LPVStateSpace(VersionedPickle):
     covariance: ArrayLike | None = None
     units: Mapping[str, str] | None = None
     steady_start: bool = False
+    hold: str = "zoh"
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -222,6 +227,7 @@ class LPVStateSpace(VersionedPickle):
         object.__setattr__(self, "units", units_by_name(self.units))
         steady = flag("steady_start", self.steady_start)
         object.__setattr__(self, "steady_start", steady)
+        one_of("hold", self.hold, ("zoh", "foh"))
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
         for T in self.bases:
@@ -624,8 +630,8 @@ class LPVStateSpace(VersionedPickle):
     ) -> Array:
         """Simulate along a measured scheduling trajectory.
 
-        Input and scheduling are held over each sampling period, so that a constant
-        scheduling gives exactly the sampled LTI model.
+        Input (with ``hold="zoh"``) and scheduling are held over each sampling period,
+        so that a constant scheduling gives exactly the sampled LTI model.
 
         Parameters
         ----------
@@ -1097,8 +1103,9 @@ class LPVStateSpace(VersionedPickle):
         """Outputs of runs along one trajectory: inputs (n_samples, n_inputs, n_runs).
 
         ``x[k+1] = A(kappa_k) x[k] + B(kappa_k) u[k]`` with the zero-order-hold matrices
-        at every sample, a block of samples at a time. Inputs left out are zero; one
-        more than the model has is the part that the offsets have.
+        at every sample, and with the first-order hold ``+ G(kappa_k) u[k+1]``, a block
+        of samples at a time. Inputs left out are zero; one more than the model has is
+        the part that the offsets have.
         """
         dt = positive_time("sampling_time", dt)
         self._tell_extrapolation(kappa)
@@ -1107,11 +1114,17 @@ class LPVStateSpace(VersionedPickle):
         if self.rate_terms is not None:
             path = np.hstack([kappa, rates_of_change(kappa, dt)])
         y = np.empty((len(u), self.n_outputs, u.shape[2]))
+        n, n_driving = self.order, u.shape[1]
+        n_held = self.n_inputs + (self.offsets is not None)
         for start in range(0, len(u), _BLOCK):
             rows = slice(start, start + _BLOCK)
             S = model._held_matrices(path[rows], dt)
-            A, B, C, D = blocks(S[:, :, : self.order + u.shape[1]], self.order)
+            A, B, C, D = blocks(S[:, :, : n + n_driving], n)
             forcing = B @ u[rows]
+            if self.hold == "foh":
+                ahead = slice(n + n_held, n + n_held + n_driving)
+                coming = np.concatenate([u[rows][1:], u[rows.stop :][:1]])
+                forcing[: len(coming)] += S[: len(coming), :n, ahead] @ coming
             with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
                 states = state_trajectory(A, forcing, x)
                 y[rows] = C @ states + D @ u[rows]
@@ -1143,6 +1156,7 @@ class LPVStateSpace(VersionedPickle):
         """``[[Ad, Bd], [C, D]]`` at scheduling values and, with rate terms, rates.
 
         Offsets are an input that is one: ``f = -A x0 - B u0``, ``y0 - C x0 - D u0``.
+        With a hold of order one the columns of the next sample's inputs follow.
         """
 
         def held(points: Array) -> Array:
@@ -1163,15 +1177,23 @@ class LPVStateSpace(VersionedPickle):
                     np.concatenate([B, -A @ x0 - B @ u0], 2),
                     np.concatenate([D, y0 - C @ x0 - D @ u0], 2),
                 )
+            ahead = np.zeros_like(B[:, :, :0])
             try:
-                Ad, Bd = sample_zoh(A, B, dt)
+                if self.hold == "zoh":
+                    Ad, Bd = sample_zoh(A, B, dt)
+                else:
+                    Ad, Bd, ahead = sample_foh(A, B, dt)
+                    Bd = Bd - ahead
             except ValueError:  # it overflows within a sample
                 raise DivergenceError(
                     f"the simulation diverges within one sample of {dt:g} s. "
                     f"{self._why_it_diverges(points)}"
                 ) from None
-            upper, lower = np.concatenate([Ad, Bd], 2), np.concatenate([C, D], 2)
-            return np.concatenate([upper, lower], 1)
+            none = np.zeros((*D.shape[:2], ahead.shape[2]))
+            upper, lower = [Ad, Bd, ahead], [C, D, none]
+            return np.concatenate(
+                [np.concatenate(upper, 2), np.concatenate(lower, 2)], 1
+            )
 
         if path.shape[1] == 1:
             return tabulate(held, path[:, 0])

@@ -11,12 +11,13 @@ direction E of a parameter and ``v = [x; u]`` that is the one of ``exp(M h) v``,
 
     sum_j A^j E sum_k h^(j+k+1) / (j+k+1)! M^k v,    M = [A, B; 0, 0],
 
-a series on vectors, summed by Horner's rule; steps h are as short as it needs.
+a series on vectors, summed by Horner's rule; steps h are as short as it needs. Where
+inputs go on linearly between samples, with the slope s, ``M v`` is ``[A x + B u; s]``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from scipy.special import factorial
 from ..models.statespace import split_delay
 from ..models.system_matrix import blocks
 from ..systems.balancing import in_even_units
-from ..systems.sampling import sample_zoh
+from ..systems.sampling import sample_foh, sample_zoh
 from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
 from .model import LPVStateSpace, rates_of_change
@@ -94,7 +95,11 @@ def output_slopes(
     """
     n, delay = model.order, split_delay(model.input_delay, dt)[0]
     u0, before = model.input_offset(kappa), model.beginning(u, kappa)[1]
-    late = delayed(u, delay, np.repeat(before, delay)) - u0
+    late = delayed(u, delay, np.repeat(before, delay))
+    change = np.zeros_like(late)
+    if model.hold == "foh":
+        change[:-1] = np.diff(late, axis=0)
+    late -= u0
     rates = rates_of_change(kappa, dt)
     unit = _units(model, kappa, rates)
     moved_by = _moving_entries(model, free)
@@ -105,27 +110,44 @@ def output_slopes(
         rows = slice(start, min(start + size, len(u)))
         A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit, moved_by)
         offset = model.state_offset(kappa[rows]) / unit
-        w = late[rows]
+        w, dw = late[rows], change[rows]
         n_steps = _steps_of(_norm(A) * dt)
         h = dt / n_steps
-        Ah, Bh = sample_zoh(A, B, h)
-        Ad, Bd = (Ah, Bh) if n_steps == 1 else sample_zoh(A, B, dt)
-        moved = offset - (Ad @ offset[:, :, None])[:, :, 0]
-        states = state_trajectory(Ad, moved + (Bd @ w[:, :, None])[:, :, 0], x)
+        in_step = _sampled(model.hold, A, B, h)
+        Ad, *inputs = in_step if n_steps == 1 else _sampled(model.hold, A, B, dt)
+        moved = _summed(inputs, (w, dw)) + offset - _times(Ad, offset)
+        states = state_trajectory(Ad, moved, x)
         xi = states - offset
         direct = _directed(E[..., n:, :], np.concatenate([xi, w], axis=1))
         F = np.zeros((len(w), n, direct.shape[2]))
+        dw = dw / n_steps
         for _ in range(n_steps):
-            F = Ah @ F + _step_slopes(A, B, E[..., :n, :], xi, w, h)
-            xi = (Ah @ xi[:, :, None] + Bh @ w[:, :, None])[:, :, 0]
+            F = in_step[0] @ F + _step_slopes(A, B, E[..., :n, :], xi, (w, dw / h), h)
+            xi = _summed(in_step, (xi, w, dw))
+            w = w + dw
         F = np.concatenate([F, direct], axis=1)
         F = _by_coefficients(model, kappa[rows], rates[rows], F, free, moved_by)
         free_states = state_trajectory(Ad, np.zeros((len(w), n, n)), own)
         slopes = state_trajectory(Ad, F[:, :n], X)
         yield rows, np.concatenate([C @ free_states, C @ slopes + F[:, n:]], axis=2)
-        x = Ad[-1] @ states[-1] + moved[-1] + Bd[-1] @ w[-1]
+        x = Ad[-1] @ states[-1] + moved[-1]
         own = Ad[-1] @ free_states[-1]
         X = Ad[-1] @ slopes[-1] + F[-1, :n]
+
+
+def _sampled(hold: str, A: Array, B: Array, dt: float) -> tuple[Array, ...]:
+    """What the state, inputs and (with "foh") their changes make of the next state."""
+    return sample_zoh(A, B, dt) if hold == "zoh" else sample_foh(A, B, dt)
+
+
+def _summed(matrices: Sequence[Array], vectors: Sequence[Array]) -> Array:
+    """The sum of their products; vectors that no matrix stands for are zero."""
+    return np.asarray(sum(map(_times, matrices, vectors)))
+
+
+def _times(M: Array, v: Array) -> Array:
+    """Products of matrices (n_samples, n, k) with a vector (n_samples, k) each."""
+    return np.asarray((M @ v[:, :, None])[:, :, 0])
 
 
 def _slopes_of_beginning(
@@ -256,16 +278,21 @@ def _directed(E: Array, v: Array) -> Array:
     return (v @ flat).reshape(len(v), n_rows, n_directions)
 
 
-def _step_slopes(A: Array, B: Array, E: Array, x: Array, u: Array, h: float) -> Array:
-    """Derivatives of the state after h by the directions E, (n_samples, n, n_dir)."""
+def _step_slopes(
+    A: Array, B: Array, E: Array, x: Array, inputs: tuple[Array, Array], h: float
+) -> Array:
+    """Derivatives of the state after h by the directions E, (n_samples, n, n_dir).
+
+    `inputs` are their values and slopes at the beginning.
+    """
     norm, order = _norm(A) * h, 2
     while norm**order / factorial(order) > _TRUNCATION:
         order += 1
-    z = (A @ x[:, :, None] + B @ u[:, :, None])[:, :, 0]
-    powers = [np.concatenate([x, u], axis=1)]
-    for _ in range(order - 1):  # M^k v
-        powers.append(np.concatenate([z, np.zeros_like(u)], axis=1))
-        z = (A @ z[:, :, None])[:, :, 0]
+    z, still = x, np.zeros_like(inputs[0])
+    powers = []
+    for u in (*inputs, *[still] * order)[:order]:  # M^k v
+        powers.append(np.concatenate([z, u], axis=1))
+        z = _times(A, z) + _times(B, u)
     stacked = np.array(powers)
     k = np.arange(1, order + 1)
     weight = h**k / factorial(k)

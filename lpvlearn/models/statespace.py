@@ -20,7 +20,13 @@ from ..exceptions import (
 from ..systems.balancing import Balancing, align_signs, balancing_transformations
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
-from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh_late
+from ..systems.sampling import (
+    c2d_foh,
+    c2d_tustin,
+    d2c_held,
+    d2c_tustin,
+    sample_zoh_late,
+)
 from ..systems.simulation import (
     delayed,
     estimate_initial_state,
@@ -52,7 +58,7 @@ _SAME_TIME = 1e-6
 
 _SINGULAR = 1e14  # a change of basis worse conditioned, once scaled, leaves two digits
 
-_METHODS = ("zoh", "tustin")
+_METHODS = ("zoh", "foh", "tustin")
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -600,16 +606,19 @@ class StateSpace(VersionedPickle):
         ----------
         sampling_time : float
             Seconds.
-        method : {"zoh", "tustin"}, default="zoh"
-            Zero-order hold is exact for inputs held between samples; Tustin is the
-            bilinear approximation. A delay that is no whole number of samples stays
-            exact with "zoh" by one state more for its input.
+        method : {"zoh", "foh", "tustin"}, default="zoh"
+            The hold of order zero is exact for inputs held between samples, that of
+            order one for inputs that go on linearly from sample to sample, as smooth
+            ones nearly do (its state is ``x - B1 u``); Tustin is the bilinear
+            approximation. A delay that is no whole number of samples stays exact with
+            "zoh" by one state more for its input.
 
         Raises
         ------
         ValueError
-            If the model is discrete, a pole is at 2 / sampling_time or a delay no whole
-            number of samples for "tustin", or the sampled model overflows.
+            If the model is discrete, a pole is at 2 / sampling_time for "tustin", a
+            delay no whole number of samples for another than "zoh", or the sampled
+            model overflows.
 
         Examples
         --------
@@ -629,30 +638,32 @@ class StateSpace(VersionedPickle):
             return self._of(*sample_zoh_late(*matrices, dt, late), dt, delay)
         if late.any():
             raise ValueError(
-                "`method='tustin'` needs delays that are whole numbers of samples of "
-                f"{dt:g} s. Got {self}. Use `method='zoh'`, which is exact."
+                f"`method={method!r}` needs delays that are whole numbers of samples "
+                f"of {dt:g} s. Got {self}. Use `method='zoh'`, which is exact."
             )
-        return self._of(*c2d_tustin(*matrices, dt), dt, delay)
+        sample = c2d_foh if method == "foh" else c2d_tustin
+        return self._of(*sample(*matrices, dt), dt, delay)
 
     def to_continuous(self, method: str = "zoh") -> StateSpace:
         """Convert a discrete-time model to continuous time.
 
         Parameters
         ----------
-        method : {"zoh", "tustin"}, default="zoh"
-            "zoh" is the matrix logarithm, exact for inputs held between samples;
-            "tustin" is the bilinear approximation, which warps frequencies.
+        method : {"zoh", "foh", "tustin"}, default="zoh"
+            "zoh" is the matrix logarithm, exact for inputs held between samples, "foh"
+            the same for inputs that go on linearly from sample to sample; "tustin" is
+            the bilinear approximation, which warps frequencies.
 
         Raises
         ------
         ValueError
-            If a pole has no continuous equivalent (at 0 for "zoh", at -1 for "tustin"),
-            or the sampling time is not known.
+            If a pole has no continuous equivalent (at -1 for "tustin", else at 0), or
+            the sampling time is not known.
 
         Warns
         -----
         RuntimeWarning
-            If a pole on the negative real axis becomes a pair ("zoh").
+            If a pole on the negative real axis becomes a pair (but for "tustin").
 
         Examples
         --------
@@ -672,7 +683,7 @@ class StateSpace(VersionedPickle):
         if method == "tustin":
             matrices = d2c_tustin(self.A, self.B, self.C, self.D, dt)
             return self._of(*matrices, input_delay=dt * self.input_delay)
-        A, B, C, doubled = d2c_zoh(self.A, self.B, self.C, dt)
+        A, B, C, D, doubled = d2c_held(self.A, self.B, self.C, self.D, dt, method)
         if len(doubled):
             warn(
                 f"{len(doubled)} pole(s) on the negative real axis "
@@ -681,7 +692,7 @@ class StateSpace(VersionedPickle):
                 "grows by one. A shorter sampling time or a lower order avoids it.",
                 RuntimeWarning,
             )
-        return self._of(A, B, C, self.D, input_delay=dt * self.input_delay)
+        return self._of(A, B, C, D, input_delay=dt * self.input_delay)
 
     def to_control(self, **names: Any) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control).

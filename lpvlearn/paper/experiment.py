@@ -158,7 +158,7 @@ def run_paper_experiment(
         data.operating_points[:, None],
         sampling_time=data.sampling_time,
         combine=roles["combine"],
-        discretization=pipeline.discretization,
+        discretization="zoh",
     )
     with watch.step("validation"):
         kappa = pipeline.operating_points_

@@ -17,7 +17,7 @@ from ..data.experiments import NO_TIME, Experiment, are_beginnings
 from ..data.operating_points import check_outputs, without_spikes
 from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing
+from ..exceptions import all_or_nothing, retold
 from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator
 from ..lpv.model import LPVStateSpace
@@ -41,7 +41,13 @@ from .checks.bands import output_errors
 from .checks.error_warnings import tell_of_errors
 from .checks.stability import growth_rates
 from .refining.coefficients import NO_COEFFICIENTS
-from .refining.errors import begins_held, errors_along, own_of, record_of
+from .refining.errors import (
+    begins_held,
+    errors_along,
+    follow_ramps,
+    own_of,
+    record_of,
+)
 from .refining.starts import Wanted, best_start
 from .running.workers import check_jobs, results_of
 from .scheduled import ScheduledEstimator
@@ -118,9 +124,11 @@ class OutputErrorLPV(ScheduledEstimator):
     Attributes
     ----------
     lpv_ : LPVStateSpace
-        The refined model. Signals that `start` gives no names have those of the table.
-        Its `steady_start` is True where all experiments together begin nearer to where
-        their first inputs hold it than to rest.
+        The refined model. Its inputs go on linearly between samples (``hold="foh"``)
+        where those of `start` do, or without an LPV model to start from where smooth
+        inputs are far likelier so. Signals that `start` gives no names have those of
+        the table. Its `steady_start` is True where all experiments together begin
+        nearer to where their first inputs hold it than to rest.
     rate_ : bool
         Whether it has rate terms.
     coefficients_ : ndarray of shape (n_coefficients,)
@@ -283,7 +291,13 @@ class OutputErrorLPV(ScheduledEstimator):
             output_names=start.output_names or names,
             units={**(start.units or {}), **(self.units or {})} or None,
         )
-        self._refine(start, experiments, dt, own)
+        with retold() as told:
+            self._refine(start, experiments, dt, own)
+            records = [record_of(e, dt) for e in experiments]
+            known = isinstance(self.start, LPVStateSpace)  # which says what inputs do
+            if not known and follow_ramps(self.lpv_, records, own):
+                told.clear()
+                self._refine(replace(start, hold="foh"), experiments, dt, own)
         if own.constant and start.offsets is None:
             self.lpv_ = replace(self.lpv_, offsets=self._mean_offset())
         levels = grid_over(self.lpv_.scheduling_range, 3)

@@ -213,8 +213,7 @@ class CovarianceFit:
     @property
     def p_value(self) -> float:
         """Of such a cost, or a higher one, if the structure is true."""
-        freedom = self.degrees_of_freedom
-        return float(chi2.sf(self.cost, freedom)) if freedom else 1.0
+        return _chance(self.cost, self.degrees_of_freedom)
 
     @property
     def misfit(self) -> float:
@@ -224,7 +223,17 @@ class CovarianceFit:
     @property
     def is_plausible(self) -> bool:
         """Whether the noise explains the cost, or nearly."""
-        return self.p_value >= IMPLAUSIBLE or self.misfit <= _MISFIT
+        return is_explained(self.cost, self.degrees_of_freedom)
+
+
+def _chance(cost: float, degrees_of_freedom: float) -> float:
+    return float(chi2.sf(cost, degrees_of_freedom)) if degrees_of_freedom else 1.0
+
+
+def is_explained(cost: float, degrees_of_freedom: float) -> bool:
+    """Whether noise explains a squared distance, or nearly."""
+    near = cost <= _MISFIT * max(degrees_of_freedom, 1)
+    return near or _chance(cost, degrees_of_freedom) >= IMPLAUSIBLE
 
 
 def efficient_parameters(

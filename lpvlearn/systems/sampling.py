@@ -1,4 +1,4 @@
-"""Conversions between continuous and discrete time (zero-order hold, Tustin)."""
+"""Conversions between continuous and discrete time (holds of two orders, Tustin)."""
 
 from __future__ import annotations
 
@@ -44,11 +44,34 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     ``exp([A B; 0 0] dt) = [Ad Bd; 0 I]``: exact for inputs held over `dt`. Raises a
     ValueError if it overflows (an unstable pole, far too fast for `dt`).
     """
+    n = A.shape[-1]
+    E = _driven(A, B, dt, 1)
+    return E[..., :n, :n], E[..., :n, n:]
+
+
+def sample_foh(A: Array, B: Array, dt: float) -> tuple[Array, Array, Array]:
+    """First-order-hold equivalents of stacked continuous ``(A, B)``.
+
+    ``x[k+1] = Ad x[k] + B0 u[k] + B1 (u[k+1] - u[k])``, with
+    ``exp([A B 0; 0 0 I/dt; 0 0 0] dt) = [Ad B0 B1; 0 I I; 0 0 I]``: exact for inputs
+    that are linear between samples. Raises a ValueError as `sample_zoh`.
+    """
     n, m = B.shape[-2:]
-    M = np.zeros(A.shape[:-2] + (n + m, n + m))
+    E = _driven(A, B, dt, 2)
+    return E[..., :n, :n], E[..., :n, n : n + m], E[..., :n, n + m :]
+
+
+def _driven(A: Array, B: Array, dt: float, n_terms: int) -> Array:
+    """Exponentials over `dt` of ``(A, B)`` with inputs that are sums of so many powers.
+
+    Of ``u + change t / dt + ...``, whose terms are states.
+    """
+    n, m = B.shape[-2:]
+    M = np.zeros(A.shape[:-2] + (n + n_terms * m,) * 2)
     with np.errstate(over="ignore", invalid="ignore"):
         M[..., :n, :n] = A * dt
-        M[..., :n, n:] = B * dt
+        M[..., :n, n : n + m] = B * dt
+        M[..., n : n + (n_terms - 1) * m, n + m :] = np.eye((n_terms - 1) * m)
         E = _expm(M)
     if not np.isfinite(E).all():
         fastest = np.linalg.eigvals(A).real.max()
@@ -56,7 +79,19 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
             "`sampling_time` must be short for the fastest pole: the sampled model "
             f"overflows. Got {dt:g} s, and a pole of real part {fastest:.3g} rad/s."
         )
-    return E[..., :n, :n], E[..., :n, n:]
+    return E
+
+
+def c2d_foh(
+    A: Array, B: Array, C: Array, D: Array, dt: float
+) -> tuple[Array, Array, Array, Array]:
+    """First-order-hold equivalent, in the state ``x[k] - B1 u[k]`` (see `sample_foh`).
+
+    In that the inputs that are still to come do not enter: ``Bd = Ad B1 + B0 - B1``,
+    ``Dd = D + C B1``.
+    """
+    Ad, B0, B1 = sample_foh(A, B, dt)
+    return Ad, Ad @ B1 + B0 - B1, C.copy(), D + C @ B1
 
 
 def sample_zoh_late(
@@ -111,29 +146,33 @@ class Held(NamedTuple):
     A: Array
     B: Array
     C: Array
+    D: Array
     doubled: Array  # the sampled model's poles on the negative axis: pairs now
 
 
-def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> Held:
-    """Inverse of `sample_zoh` by the matrix logarithm.
+def d2c_held(
+    A: Array, B: Array, C: Array, D: Array, dt: float, method: str = "zoh"
+) -> Held:
+    """Inverse of `sample_zoh`, or `c2d_foh`, by the matrix logarithm.
 
     A real pole on the negative axis has no real logarithm. As in the control
     literature, it becomes a complex pair at the Nyquist frequency: the response at
     the sampling instants stays exact and the order grows by one.
 
     The model keeps its state basis (the states of poles on the negative axis come
-    twice) and its feedthrough. Raises a ValueError if a pole is at the origin (a pure
-    delay has no continuous equivalent), or the logarithm is lost in rounding.
+    twice), behind a hold of order zero its feedthrough too. Raises a ValueError if a
+    pole is at the origin (a pure delay has no continuous equivalent), or the logarithm
+    is lost in rounding.
     """
     n = len(A)
     if n == 0:
-        return Held(A.copy(), B.copy(), C.copy(), np.empty(0))
+        return Held(A.copy(), B.copy(), C.copy(), D.copy(), np.empty(0))
     A, scale = in_even_units(A)
     poles = np.linalg.eigvals(A)
     size = np.abs(poles)
     if _has_eigenvalue(A, poles, 0.0, tol=_AT_ORIGIN):
         raise ValueError(
-            "`method='zoh'` needs poles away from the origin: a pole at "
+            f"`method={method!r}` needs poles away from the origin: a pole at "
             f"{size.min():.1e} is a pure delay and has no continuous equivalent. Use "
             "`method='tustin'` or a lower order."
         )
@@ -146,17 +185,26 @@ def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> Held:
         C = np.hstack([C, np.zeros((C.shape[0], extra))])
     else:
         L = _logarithm(A)
-    # B enters the sampled model through the integral of exp(A t) over one hold
-    back, hold = sample_zoh(L, np.eye(len(L)), 1.0)
+    # B enters the sampled model through integrals of exp(A t) over one hold
+    eye = np.eye(len(L))
+    if method == "zoh":
+        (back, hold), ramp = sample_zoh(L, eye, 1.0), np.zeros_like(L)
+    else:
+        back, hold, _, ramp = c2d_foh(L, eye, eye, np.zeros_like(L), 1.0)
     if np.abs(back[:n, :n] - A).max() > _ROUND_TRIP * np.abs(A).max():
         raise ValueError(
-            "`method='zoh'` needs a state matrix with an accurate logarithm. Got poles "
-            f"{np.array2string(poles, precision=3)}, too near to one another or to the "
-            "origin. Use `method='tustin'` or a lower order."
+            f"`method={method!r}` needs a state matrix with an accurate logarithm. Got "
+            f"poles {np.array2string(poles, precision=3)}, too near to one another or "
+            "to the origin. Use `method='tustin'` or a lower order."
         )
-    B_c = scale[:, None] * np.linalg.solve(hold, B / scale[:, None]) / dt
-    A_c = scale[:, None] * L / scale / dt
-    return Held(A_c, B_c, C.copy(), poles[negative].real)
+    moved = np.linalg.solve(hold, B / scale[:, None])
+    return Held(
+        scale[:, None] * L / scale / dt,
+        scale[:, None] * moved / dt,
+        C.copy(),
+        D - C * scale @ ramp @ moved,
+        poles[negative].real,
+    )
 
 
 def _has_eigenvalue(A: Array, poles: NDArray, value: float, tol: float) -> bool:

@@ -85,7 +85,8 @@ ANY = st.sampled_from(VALUES)
 WORDS = (
     *("auto", "all", "local", "default", "rest", "estimate", "raise", "split", "skip"),
     *("n4sid", "cva", "pi-moesp", "po-moesp", "pbsid", "simulation", "prediction"),
-    *("warn", "enforce", "constant", "linear", "pool", "average", "zoh", "tustin"),
+    *("warn", "enforce", "constant", "linear", "pool", "average", "zoh", "foh"),
+    *("tustin",),
     *("hinf", "linf", "h2", "covariance", "similarity", "random", "sqp", "bundle"),
     *("power", "chebyshev", "legendre", "total", "tensor", "pchip", "cubic", "aic"),
     *("bic", "clip", "error", "ignore", "raw_values", "uniform_average", "pandas"),

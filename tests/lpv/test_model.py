@@ -23,6 +23,7 @@ from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.lpv import model as model_module
 from lpvlearn.lpv.bands import simulation_std
+from lpvlearn.systems.sampling import sample_foh
 
 from ..conftest import spring_lpv
 
@@ -144,6 +145,34 @@ def test_blocks_of_samples_join_without_a_seam(monkeypatch):
     monkeypatch.setattr(model_module, "_BLOCK", 64)
     assert_allclose(model.simulate(u, kappa, DT, x0), y, atol=1e-12)
     assert_allclose(model.free_responses(kappa, DT), free, atol=1e-12)
+
+
+def test_inputs_that_go_on_linearly_are_those_of_many_more_samples(monkeypatch):
+    """Held over the middles of these, by which outputs are exact to second order."""
+    monkeypatch.setattr(model_module, "_BLOCK", 64)
+    model, u, n = about_offsets(hold="foh"), inputs(150), 200
+    between = (np.arange(n * 149) + 0.5) / n
+    fine = np.column_stack([np.interp(between, np.arange(150), v) for v in u.T])
+    kappa = np.full(len(fine), 0.7)
+    held = replace(model, hold="zoh")
+    expected = held.simulate(fine, kappa, DT / n, [1.0, 0.0])[::n, 0]
+    y = model.simulate(u, kappa[:150], DT, [1.0, 0.0])[:149, 0]
+    coarse = held.simulate(u, kappa[:150], DT, [1.0, 0.0])[:149, 0]
+    assert np.abs(y - expected).max() < 1e-4 * np.abs(coarse - expected).max()
+
+
+def test_at_a_constant_value_it_is_the_sampled_model_with_ramps():
+    model, u = replace(spring(), hold="foh"), inputs(200)
+    x0 = np.array([0.3, -1.0])
+    sampled = model.at(0.7).to_discrete(DT, "foh")
+    start = x0 - sample_foh(model.at(0.7).A, model.at(0.7).B, DT)[2] @ u[0]
+    y = model.simulate(u, np.full(200, 0.7), DT, x0)
+    assert_allclose(y, sampled.simulate(u, initial_state=start), atol=1e-12)
+    free = model.free_responses(np.full(200, 0.7), DT)
+    rest = model.simulate(u, np.full(200, 0.7), DT)
+    assert_allclose(y, rest + free @ x0, atol=1e-12)
+    with pytest.raises(ValueError, match="`hold` must be 'zoh' or 'foh'. Got 'tustin'"):
+        replace(model, hold="tustin")
 
 
 def test_more_samples_than_one_block():

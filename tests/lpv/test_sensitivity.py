@@ -88,8 +88,9 @@ def slopes_and_differences(model, n_samples=60, dt=STEP):
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("rates", [False, True])
-def test_slopes_equal_differences(name, rates):
-    model = MODELS[name]()
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_slopes_equal_differences(name, rates, hold):
+    model = replace(MODELS[name](), hold=hold)
     if rates:
         model = with_rate_terms(model)[0]
     found, expected = slopes_and_differences(model)

@@ -170,7 +170,7 @@ def test_pure_gain_has_every_method():
     assert gain.transform(np.zeros((0, 0))).order == 0
     assert ((gain - gain).D == 0).all()
     np.testing.assert_array_equal((gain - random_model(0, 2, 3, 2)).A.shape, (2, 2))
-    for method in ("zoh", "tustin"):
+    for method in ("zoh", "foh", "tustin"):
         sampled = gain.to_discrete(0.1, method)
         np.testing.assert_array_equal(sampled.D, D)
         np.testing.assert_array_equal(sampled.to_continuous(method).D, D)
@@ -401,7 +401,7 @@ def test_time_in_samples_agrees_with_any_step_but_not_with_continuous_time():
     assert (samples - samples).sampling_time is True
     with pytest.raises(ValueError, match="same inputs, outputs and sampling time"):
         samples - StateSpace(-0.5, 1, 1)
-    for method in ("zoh", "tustin"):
+    for method in ("zoh", "foh", "tustin"):
         with pytest.raises(ValueError, match="`sampling_time` must be known.*`time=`"):
             samples.to_continuous(method)
 
@@ -563,6 +563,8 @@ def test_what_cannot_be_done_with_delays_says_what_can():
     continuous = random_model(0).with_input_delay(0.25)
     with pytest.raises(ValueError, match="Use `method='zoh'`"):
         continuous.to_discrete(0.1, "tustin")
+    with pytest.raises(ValueError, match="'foh'` needs delays that are whole numbers"):
+        continuous.to_discrete(0.1, "foh")
     with pytest.raises(ValueError, match="needs a discrete-time model: no finite"):
         continuous.absorb_delay()
     with pytest.raises(ValueError, match="`to_control` needs a model without delay"):
@@ -584,6 +586,7 @@ def test_what_is_no_delay_is_refused(delay):
     [
         lambda m: m.to_discrete(0.1),
         lambda m: m.to_discrete(0.1, "tustin").to_continuous("tustin"),
+        lambda m: m.to_discrete(0.1, "foh").to_continuous("foh"),
         lambda m: m.to_discrete(0.1).to_continuous(),
         lambda m: m.transform(2 * np.eye(2)),
         lambda m: m.balance(),

@@ -284,7 +284,7 @@ def test_failure_names_its_point_and_can_be_skipped(spring):
 
 ERRORS = [
     ({"combine": "sum"}, "`combine` must be 'pool' or 'average'"),
-    ({"discretization": "euler"}, "`discretization` must be 'zoh' or"),
+    ({"discretization": "euler"}, "`discretization` must be 'auto', 'zoh'"),
     ({"on_error": "ignore"}, "`on_error` must be 'raise' or"),
     ({"local": SubspaceLTI(inputs=[0])}, "`inputs` must be given to LocalLPVPipe"),
     ({"restructurer": "none"}, "`restructurer` must be an estimator"),

@@ -13,10 +13,12 @@ from sklearn.model_selection import GridSearchCV, cross_validate
 from lpvlearn import (
     GrayBoxStructure,
     LocalLPVPipeline,
+    LPVStateSpace,
     OutputErrorLPV,
     PolynomialLPV,
     SubspaceLTI,
     bft_score,
+    from_trajectories,
 )
 from lpvlearn.exceptions import ExtrapolationWarning, collected
 from lpvlearn.inspection import SimulationDisplay
@@ -404,3 +406,27 @@ def test_a_gain_without_states_has_no_rate_terms(rate):
     model = OutputErrorLPV(static, rate=rate, **ROLES).fit(X, y)
     assert not model.rate_
     np.testing.assert_allclose(model.lpv_.parameters(FINE)[:, 0], 2.0 + FINE, atol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_smooth_inputs_of_moving_records_are_held_or_ramps(hold):
+    rng = np.random.default_rng(0)
+    t, kappa = np.arange(600), 1 - np.cos(np.linspace(0, 9, 600))
+    f = np.linspace(0.01, 1 / 10, 15)
+    u = np.cos(2 * np.pi * f * t[:, None] + rng.uniform(0, 6.3, 15)).sum(1)
+    ends = np.array([[0.0], [2.0]])
+    form = PolynomialLPV(1).fit(ends, [[1.0, 20.0], [2.0, 45.0]])
+    structure = GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]]
+    )
+    truth = LPVStateSpace(structure, form, ends, hold=hold)
+    y = truth.simulate(u, kappa, 0.05)
+    y += 0.02 * y.std() * rng.standard_normal(y.shape)
+    X, y = from_trajectories([(u, kappa, y)], sampling_time=0.05)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    form = PolynomialLPV(1)
+    model = OutputErrorLPV(structure, rate=False, interpolator=form, **roles)
+    assert model.fit(X, y).lpv_.hold == hold
+    found, true = (m.parameters([0.0, 1.0, 2.0]) for m in (model.lpv_, truth))
+    np.testing.assert_allclose(found, true, rtol=0.03)

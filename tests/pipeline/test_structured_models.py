@@ -352,13 +352,13 @@ def sensor_record(seed, n_samples=600, noise=(0.02, 1.0), method="zoh"):
 
 
 def sensor_pipeline(**options):
-    free = options.get("discretization") == "tustin"
+    free = options.get("discretization", "zoh") != "zoh"
     local = SubspaceLTI(2, horizon=8, feedthrough=free, sampling_time=STEP)
     options.setdefault("restructurer", GrayBoxRestructurer(SENSORS))
     return LocalLPVPipeline(local, **options)
 
 
-@pytest.mark.parametrize("discretization", ["zoh", "tustin"])
+@pytest.mark.parametrize("discretization", ["zoh", "foh", "tustin"])
 def test_efficient_parameters_are_those_of_maximum_likelihood(discretization):
     u, y, size = sensor_record(0, method=discretization)
 

@@ -13,9 +13,11 @@ from scipy.signal import cont2discrete
 from lpvlearn import StateSpace
 from lpvlearn.systems.sampling import (
     _expm,
+    c2d_foh,
     c2d_tustin,
+    d2c_held,
     d2c_tustin,
-    d2c_zoh,
+    sample_foh,
     sample_zoh,
 )
 
@@ -59,13 +61,46 @@ CONTINUOUS = {
 @pytest.mark.parametrize("name", CONTINUOUS)
 @pytest.mark.parametrize("similar", [True, False])
 def test_zoh_is_undone_by_the_logarithm(name, similar):
-    A, B, C, _ = system(CONTINUOUS[name], similar=similar)
-    A2, B2, C2, _ = d2c_zoh(*sample_zoh(A, B, 0.1), C, 0.1)
+    A, B, C, D = system(CONTINUOUS[name], similar=similar)
+    A2, B2, C2, D2, _ = d2c_held(*sample_zoh(A, B, 0.1), C, D, 0.1)
     # a pole that decays to 5e-5 within a sample has lost these digits
     tol = 1e-8 if name == "time scales" else 1e-10
     assert_allclose(A2, A, atol=tol * np.abs(A).max())
     assert_allclose(B2, B, atol=tol * np.abs(B).max() * max(1, np.abs(A).max()))
     assert_allclose(C2, C)
+    assert_allclose(D2, D)
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+@pytest.mark.parametrize("similar", [True, False])
+def test_ramps_are_undone_by_the_logarithm(name, similar):
+    A, B, C, D = system(CONTINUOUS[name], similar=similar)
+    found = d2c_held(*c2d_foh(A, B, C, D, 0.1), 0.1, "foh")
+    tol = 1e-8 if name == "time scales" else 1e-10
+    for own, expected in zip(found, (A, B, C, D), strict=False):
+        size = np.abs(expected).max() * max(1, np.abs(A).max())
+        assert_allclose(own, expected, atol=tol * size)
+
+
+def test_ramps_are_those_of_scipy():
+    A, B, C, D = system(CONTINUOUS["oscillating"])
+    expected = cont2discrete((A, B, C, D), 0.1, method="foh")
+    for own, other in zip(c2d_foh(A, B, C, D, 0.1), expected, strict=False):
+        assert_allclose(own, other, atol=1e-13)
+
+
+def test_inputs_that_are_ramps_are_answered_exactly():
+    """As ten thousand steps of a hold answer them, and inputs that stay as a hold."""
+    A, B, _, _ = system(CONTINUOUS["distinct"])
+    Ad, B0, B1 = sample_foh(A, B, 0.1)
+    held = sample_zoh(A, B, 0.1)
+    assert_allclose(Ad, held[0], atol=1e-15)
+    assert_allclose(B0, held[1], atol=1e-15)
+    n, x = 10_000, np.zeros((3, 2))
+    F, G = sample_zoh(A, B, 0.1 / n)
+    for k in range(n):
+        x = F @ x + G * (k + 0.5) / n
+    assert_allclose(B1, x, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
@@ -206,8 +241,8 @@ def test_a_pole_at_the_origin_has_no_logarithm(A):
 
 
 def test_faint_poles_that_are_not_zero_are_converted():
-    A, B, C, _ = system(np.diag([1e-5, 0.5]))
-    Ac, Bc, *_ = d2c_zoh(A, B, C, 1.0)
+    A, B, C, D = system(np.diag([1e-5, 0.5]))
+    Ac, Bc, *_ = d2c_held(A, B, C, D, 1.0)
     assert_allclose(np.sort(np.linalg.eigvals(Ac)), np.log([1e-5, 0.5]), rtol=1e-9)
     assert_allclose(sample_zoh(Ac, Bc, 1.0)[0], A, atol=1e-14)
 
@@ -230,7 +265,7 @@ def test_units_of_the_states_do_not_matter():
     A, B, C, D = system(block_diag(jordan(0.9, 2), -0.4, 0.2))
     units = 10.0 ** np.array([-6.0, 6.0, 0.0, 3.0])
     scaled = units[:, None] * A / units, units[:, None] * B, C / units
-    a, b, c, doubled = d2c_zoh(*scaled, 0.1)
+    a, b, c, _, doubled = d2c_held(*scaled, D, 0.1)
     assert_allclose(doubled, [-0.4])
     expected = markov(A, B, C)
     found = markov(*sample_zoh(a, b, 0.1), c)

@@ -130,6 +130,7 @@ FORMS: dict[type, dict[str, str]] = {
         "output_names": "any?",
         "units": "any?",
         "steady_start": "flag?",
+        "hold": "text?",
     },
     PolynomialLPV: _POINTS
     | _MISFIT

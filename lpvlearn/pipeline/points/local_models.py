@@ -231,9 +231,31 @@ def _averaged(
         lti,
         **_told_by(kept[0], first),
         realizations=models,
+        discretization=discretization,
         estimates=estimates if known else [],
         n_trend=max(map(_n_trend, kept)),
         rest=_equilibrium(lti, kept, experiments),
+    )
+
+
+def as_ramps(model: LocalModel, experiments: Sequence[Experiment]) -> LocalModel:
+    """The model whose inputs are ramps between samples, of one for held inputs.
+
+    It has `estimates`. Raises a ValueError where it has no equivalent.
+    """
+    estimates: list[Estimate] = [
+        (estimate.to_continuous("foh"), _all_continuous(list(pairs), "foh"))
+        for estimate, pairs in model.estimates
+    ]
+    models = [estimate for estimate, _ in estimates]
+    if len(models) > 1:
+        models = _in_one_basis(models, experiments)
+        lti = _average(models)
+    else:
+        (lti,), models = models, []
+        lti = lti.balance() if lti.is_stable else lti
+    return replace(
+        model, lti=lti, realizations=models, estimates=estimates, discretization="foh"
     )
 
 

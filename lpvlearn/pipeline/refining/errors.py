@@ -18,7 +18,7 @@ from ...data.experiments import Experiment, naming
 from ...exceptions import warn
 from ...lpv.bands import levels_of
 from ...lpv.model import LPVStateSpace
-from ...lpv.refinement import Own, Record, simulated, squares, weights_of
+from ...lpv.refinement import Own, Record, refine, simulated, squares, weights_of
 from ...lpv.weighting import is_chance
 from ..checks.bands import output_errors
 from ..checks.error_warnings import tell_of_noisy_scheduling
@@ -35,6 +35,11 @@ _MISSED, _MORE = 0.2, 3.0
 # Part of what a beginning at rest misses that one held by the first inputs may miss,
 # and of its squares what is rounding
 _NEARER, _ROUNDING = 0.5, 1e-12
+
+# Of smooth inputs: samples that differ from the one before, and how far these are from
+# one another, relative to how far inputs move. Of a hold that is taken for another one:
+# steps after which the two are compared, and what it gains in the log-likelihood
+_MOVING, _SMOOTH, _STEPS, _LIKELIER = 0.6, 0.75, 15, 10.0
 
 
 def record_of(e: Experiment, sampling_time: float) -> Record:
@@ -140,6 +145,29 @@ def _missed(
     records = [record_of(e, dt) for e in experiments]
     errors = errors_along(model.silenced(), experiments, records, own)
     return np.asarray(levels_of(errors).model_error * weights_of(records))
+
+
+def follow_ramps(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:
+    """Whether a refined model meets records far better with ramps between samples.
+
+    By the likelihood, after some steps with each hold. Inputs that are seen to stay, or
+    jump as far as they move at all, are held.
+    """
+    changes = np.vstack([np.diff(record.u, axis=0) for record in records])
+    about = np.vstack([record.u - record.u.mean(axis=0) for record in records])
+    smooth = np.linalg.norm(changes, axis=0) < _SMOOTH * np.linalg.norm(about, axis=0)
+    if not (((changes != 0).mean(axis=0) > _MOVING) & smooth).any():
+        return False
+    noise = []
+    for hold in ("zoh", "foh"):
+        start = replace(model, hold=hold, covariance=None)
+        try:
+            found = refine(start, records, own, max_iter=_STEPS)
+        except ValueError:  # it diverges
+            return False
+        noise.append(found.deviation)
+    gain = len(changes) * np.log(noise[0] / noise[1]).sum()
+    return bool(gain > _LIKELIER)
 
 
 def begins_held(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:

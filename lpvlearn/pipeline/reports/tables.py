@@ -98,22 +98,23 @@ def tables(
     for k, (group, model, gray_box) in enumerate(
         zip(points.experiments, found.local, found.models, strict=True)
     ):
+        known = group, sampling_time, model.n_trend, lpv.hold
         row: dict[str, Any] = {
             "n_experiments": len({e.label for e in group}),
             "n_samples": sum(len(e.rows) for e in group),
             "order": model.order,
             "horizon": model.horizon,
-            "local_BFT": _fit_of(model.lti, group, sampling_time, model.n_trend),
+            "local_BFT": _fit_of(model.lti, *known),
         }
         missed |= lpv.offsets is None and _misses_constants(model, group, sampling_time)
         if found.restructurers:
-            structured = _fit_of(gray_box, group, sampling_time, model.n_trend)
+            structured = _fit_of(gray_box, *known)
             row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
         frozen = lpv.at(points.kappa[k])
         row["lpv_BFT"] = np.nan
         if not frozen.poles().real.max(initial=0.0) > 0.0:
-            row["lpv_BFT"] = _fit_of(frozen, group, sampling_time, model.n_trend)
+            row["lpv_BFT"] = _fit_of(frozen, *known)
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
@@ -132,8 +133,8 @@ def tables(
         distance = (gray_box.with_input_delay(0) - met).hinf_norm()
         size = gray_box.hinf_norm()
         # infinite with integrators, whose gains need not agree
-        known = 0 < size < np.inf
-        row["interpolation_error"] = distance / size if known else np.nan
+        finite = 0 < size < np.inf
+        row["interpolation_error"] = distance / size if finite else np.nan
         row["interpolation_FIT"] = parameter_fit(
             theta[k] / unit, interpolated[k] / unit
         )
@@ -204,6 +205,7 @@ def _fit_of(
     group: Sequence[Experiment],
     sampling_time: float,
     n_trend: int,
+    hold: str = "zoh",
 ) -> float:
     """BFT (percent, mean over the outputs) of a continuous model on experiments.
 
@@ -211,7 +213,7 @@ def _fit_of(
     `n_trend` a constant (1), a constant and a drift (2) of every output. Experiments of
     one length are simulated together; realizations of one input, once.
     """
-    sampled = model.to_discrete(sampling_time)
+    sampled = model.to_discrete(sampling_time, hold)
     if n_trend and _integrates(model):  # what offsets of the inputs add up to
         n_trend = 2
     size = spread_of(np.vstack([e.measured for e in group]))

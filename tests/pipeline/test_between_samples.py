@@ -1,0 +1,109 @@
+"""Inputs that are held between samples, and inputs that are smooth."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    from_trajectories,
+    load,
+    save,
+)
+
+DT = 0.05
+
+SPRING = GrayBoxStructure.from_template(
+    A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
+)
+TRUE = np.array([[3.0, 1.5, 40.0 + 20.0 * kappa] for kappa in (0.0, 0.5, 1.0)])
+
+
+def waves(rng, t):
+    """Of random phases, up to 12 samples a period; t counts samples."""
+    f = np.linspace(0.02, 1 / 12, 25)
+    return np.cos(2 * np.pi * f * t[:, None] + rng.uniform(0, 6.3, 25)).sum(1)[:, None]
+
+
+def table(hold, structure=SPRING, theta=TRUE, *, noise=0.02, runs=1, n_samples=300):
+    """Three points, with inputs that are held, ramps, or smooth between samples."""
+    rng, found = np.random.default_rng(0), []
+    for kappa, row in zip((0.0, 0.5, 1.0), theta, strict=True):
+        model, fine = structure.model(row), 1 if hold in ("zoh", "foh") else 20
+        u = waves(rng, np.arange(n_samples * fine) / fine)
+        sampled = model.to_discrete(DT / fine, hold if fine == 1 else "foh")
+        u, y = u[::fine], sampled.simulate(u)[::fine]
+        for _ in range(runs):
+            error = noise * y.std(0) * rng.standard_normal(y.shape)
+            found.append((u, kappa, y + error))
+    return from_trajectories(found, sampling_time=DT)
+
+
+def pipeline(structure=SPRING, **options):
+    return LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(structure),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+        **options,
+    )
+
+
+def off(model):
+    """Largest error of the parameters, relative."""
+    return np.abs(model.parameters_.to_numpy() / TRUE - 1).max()
+
+
+def test_ramps_are_found_and_make_no_delay(tmp_path):
+    X, y = table("foh")
+    model = pipeline().fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 0.01
+    assert 100 * model.score(X, y) > 97.5
+    assert (model.report_["lpv_BFT"] > 97.5).all()
+    assert (model.report_["p_value"] > 1e-3).all()
+    save(model, tmp_path / "model.zip")
+    again = load(tmp_path / "model.zip")
+    assert again.lpv_.hold == "foh"
+    np.testing.assert_array_equal(again.predict(X), model.predict(X))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the structure")
+def test_smooth_inputs_are_nearly_ramps():
+    """As held ones they make parameters wrong by three times as much and more."""
+    X, y = table("smooth")
+    model = pipeline().fit(X, y)
+    held = pipeline(discretization="zoh").fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 0.01
+    assert held.lpv_.hold == "zoh" and off(held) > 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("combine", ["pool", "average"])
+def test_several_realizations_tell_it_too(combine):
+    X, y = table("foh", runs=3, noise=0.05)
+    model = pipeline(combine=combine).fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 0.015
+    given = pipeline(combine=combine, discretization="foh").fit(X, y)
+    np.testing.assert_allclose(given.parameters_, model.parameters_, rtol=1e-5)
+
+
+def test_held_inputs_stay_held():
+    X, y = table("zoh")
+    model = pipeline().fit(X, y)
+    assert model.lpv_.hold == "zoh" and off(model) < 0.01
+    assert off(pipeline(discretization="zoh").fit(X, y)) == off(model)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("lag", [3.0, 30.0])
+def test_what_a_structure_lacks_is_no_ramp(lag):
+    """A lag before the spring, of which the structure knows nothing."""
+    plant = GrayBoxStructure.from_template(
+        A=[[0, 1, 0], ["-k", "-c", "b"], [0, 0, -lag]],
+        B=[[0], [0], [lag]],
+        C=[[1, 0, 0]],
+    )
+    X, y = table("zoh", plant)
+    assert pipeline().fit(X, y).lpv_.hold == "zoh"
