@@ -62,6 +62,7 @@ def test_ramps_are_found_and_make_no_delay(tmp_path):
     assert 100 * model.score(X, y) > 97.5
     assert (model.report_["lpv_BFT"] > 97.5).all()
     assert (model.report_["p_value"] > 1e-3).all()
+    assert "at 0.05 s, inputs linear between them, " in model.summary()
     save(model, tmp_path / "model.zip")
     again = load(tmp_path / "model.zip")
     assert again.lpv_.hold == "foh"

@@ -106,7 +106,7 @@ def tables(
             "horizon": model.horizon,
             "local_BFT": _fit_of(model.lti, *known),
         }
-        missed |= lpv.offsets is None and _misses_constants(model, group, sampling_time)
+        missed |= lpv.offsets is None and _misses_constants(model, *known[:2], lpv.hold)
         if found.restructurers:
             structured = _fit_of(gray_box, *known)
             row["structured_BFT"] = structured
@@ -239,14 +239,14 @@ def _fit_of(
 
 
 def _misses_constants(
-    model: LocalModel, group: Sequence[Experiment], sampling_time: float
+    model: LocalModel, group: Sequence[Experiment], sampling_time: float, hold: str
 ) -> bool:
     """Whether constants would explain more of the outputs of experiments at a point."""
     if model.rest is not None and not model.n_trend:
         return False  # they have been looked for
     group, constants = group[:_LOOKED_AT], max(1, model.n_trend)
     best, without = (
-        _fit_of(model.lti, group, sampling_time, n) for n in (constants, 0)
+        _fit_of(model.lti, group, sampling_time, n, hold) for n in (constants, 0)
     )
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
     return best - without > _WORTH or (without < _POOR and any(far))
@@ -306,7 +306,8 @@ def summarise(
         f"LPV model of order {lpv.order}: {lpv.n_inputs} input(s), {lpv.n_outputs} "
         f"output(s), {found.parameters.shape[1]} parameters",
         f"{report['n_experiments'].sum()} experiment(s), {report['n_samples'].sum()} "
-        f"samples at {sampling_time:.4g} s, {places}",
+        f"samples at {sampling_time:.4g} s"
+        f"{', inputs linear between them' if lpv.hold == 'foh' else ''}, {places}",
         "",
         f"Local models: {local}, simulation fit (BFT) {_span(report['local_BFT'])} %",
     ]
