@@ -62,7 +62,7 @@ from .one_basis.between_samples import restructured_by_hold
 from .one_basis.black_boxes import foreseen_order
 from .one_basis.structured_models import (
     StructuredModels,
-    begins_held,
+    local_ones_begin_held,
     mirror_images,
     offsets_of_points,
     over_points,
@@ -608,7 +608,7 @@ list, default=None
         if moving:
             with watch.step("refinement", bar=True):  # on data that moves
                 self._refine(moving, found, runner)
-        steady = begins_held(self.lpv_, found.points, self.sampling_time_)
+        steady = local_ones_begin_held(self.lpv_, found.points, self.sampling_time_)
         self.lpv_ = replace(self.lpv_, steady_start=steady)
 
         with watch.step("interpolation and report"):

@@ -42,11 +42,11 @@ from .checks.error_warnings import tell_of_errors
 from .checks.stability import growth_rates
 from .refining.coefficients import NO_COEFFICIENTS
 from .refining.errors import (
-    begins_held,
     errors_along,
     follow_ramps,
     own_of,
     record_of,
+    records_begin_held,
 )
 from .refining.starts import Wanted, best_start
 from .running.workers import check_jobs, results_of
@@ -307,7 +307,7 @@ class OutputErrorLPV(ScheduledEstimator):
         if not self.lpv_.steady_start and (growth < 0.0).all():
             begun = compress(experiments, are_beginnings(experiments))
             records = [record_of(e, dt) for e in begun]
-            steady = begins_held(self.lpv_, records, own)
+            steady = records_begin_held(self.lpv_, records, own)
             self.lpv_ = replace(self.lpv_, steady_start=steady)
         return self
 

@@ -416,7 +416,9 @@ def offsets_of_points(
     return points_of_work(*known, structured=bool(found.restructurers)), scales
 
 
-def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> bool:
+def local_ones_begin_held(
+    model: LPVStateSpace, points: OperatingPoints, dt: float
+) -> bool:
     """Whether local experiments begin where their first inputs hold the model.
 
     And not at rest about zero, or, where there are points of work, about their means.

@@ -170,7 +170,9 @@ def follow_ramps(model: LPVStateSpace, records: Sequence[Record], own: Own) -> b
     return bool(gain > _LIKELIER)
 
 
-def begins_held(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:
+def records_begin_held(
+    model: LPVStateSpace, records: Sequence[Record], own: Own
+) -> bool:
     """Whether records begin where their first inputs hold the model, not at rest.
 
     By the squared errors of both beginnings, above those of the initial states that
