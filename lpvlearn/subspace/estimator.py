@@ -131,7 +131,9 @@ class SubspaceLTI(ScoredFromRest):
         Past and future horizon in samples; for "pbsid" the past that its first
         regression needs, by Akaike's criterion. "auto" tries a geometric grid and takes
         one whose model simulates the data as well as any. Of more than 12,000
-        samples "auto" looks at that many, spread over the experiments.
+        samples "auto" looks at that many, spread over the experiments. Where samples
+        fill a horizon of two, which states need, of each output alone but not of all
+        together (as 31 samples of eight channels), it is that of each output.
     sampling_time : float, default=None
         Seconds between samples, which must agree with the `time` column. None: the
         step of that column; without one the model counts time in samples, and is

@@ -14,6 +14,7 @@ from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
+from .conftest import sorted_poles
 
 
 @pytest.mark.filterwarnings("ignore:The model explains:UserWarning")
@@ -456,14 +457,45 @@ def test_step_tests_begin_where_they_stood(level, delay):
     np.testing.assert_allclose(known, model.predict(u), atol=0.1)
 
 
-def test_few_samples_of_many_channels_are_told(rng):
-    """A horizon of two, which states need, takes 35 samples of eight channels."""
-    u, modes = rng.standard_normal((31, 3)), rng.uniform(0.5, 0.9, 5)
-    plant = StateSpace(np.diag(modes), rng.standard_normal((5, 3)), np.eye(5), None, 1)
-    y = plant.simulate(u)
-    with pytest.warns(UserWarning, match=r"few samples \(31\).* each output alone"):
+def of_many_channels(seed, n_samples, n_states=3):
+    """Inputs, outputs and plant of eight channels."""
+    rng = np.random.default_rng(seed)
+    u, poles = rng.standard_normal((n_samples, 3)), rng.uniform(0.5, 0.9, n_states)
+    B, C = rng.standard_normal((n_states, 3)), rng.standard_normal((5, n_states))
+    plant = StateSpace(np.diag(poles), B, C, None, 1.0)
+    return u, plant.simulate(u), plant
+
+
+def test_few_samples_of_many_channels_are_told():
+    """A horizon of two, which states need, takes 19 of three inputs and an output."""
+    u, y, _ = of_many_channels(0, 18)
+    with pytest.warns(UserWarning, match=r"few samples \(18\).* Give a longer record"):
         assert SubspaceLTI().fit(u, y).order_ == 0
-    assert SubspaceLTI().fit(u, y[:, :1]).order_ > 0
+
+
+@pytest.mark.parametrize("order", ["auto", 3])
+def test_outputs_show_states_alone_where_all_together_cannot(order):
+    """All eight channels take 35 samples for a horizon of two."""
+    u, y, plant = of_many_channels(0, 31)
+    model = SubspaceLTI(order=order).fit(u, y)
+    assert model.order_ == 3 and model.horizon_ > 1
+    assert model.singular_values_.shape == (5 * model.horizon_,)
+    np.testing.assert_allclose(
+        sorted_poles(model.lti_.A), sorted_poles(plant.A), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("n_samples", "n_experiments"), [(31, 1), (9, 3)])
+@pytest.mark.parametrize("options", [{}, {"refine": False}, {"stability": "enforce"}])
+def test_few_samples_of_many_channels_have_a_model(n_samples, n_experiments, options):
+    u, y, plant = of_many_channels(1, n_samples * n_experiments)
+    y = y + 0.02 * y.std(axis=0) * np.random.default_rng(2).standard_normal(y.shape)
+    X = pd.DataFrame(u).add_prefix("u")
+    X["test"] = np.repeat(np.arange(n_experiments), n_samples)
+    model = SubspaceLTI(experiment="test", **options).fit(X, y)
+    other = np.random.default_rng(3).standard_normal((300, 3))
+    truth, found = plant.simulate(other), model.lti_.simulate(other)
+    assert bft_score(truth, found) > 70.0
 
 
 def test_runs_after_a_gap_are_no_beginnings():

@@ -141,6 +141,9 @@ def test_limits_count_columns_rows_and_instruments():
         h = Settings(freedom(1, 2)).max_horizon(lengths)
         columns = [sum(max(0, n - 2 * k + 1) for n in lengths) for k in (h, h + 1)]
         assert columns[0] >= 6 * h and columns[1] < 6 * (h + 1)
+    assert Settings(freedom(5, 3)).max_horizon([35]) == 2  # of all channels
+    assert Settings(freedom(5, 3)).max_horizon([34]) == 3  # of an output and the inputs
+    assert Settings(freedom(5, 3)).max_horizon([18]) == 1
     assert Settings(freedom(3, 1)).max_order(5) == 12
     assert Settings(freedom(3, 1), "pi-moesp").max_order(5) == 5
 

@@ -207,7 +207,7 @@ def _warn_of_error(
                 "useless",
                 f"{_next_to_nothing(fitted)} So few samples ({max(n_samples)}) carry "
                 f"no states beside {sum(free.direct.shape)} inputs and outputs. Give a "
-                "longer record, or identify each output alone.",
+                "longer record.",
             )
         else:
             telling.once(

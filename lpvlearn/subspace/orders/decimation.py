@@ -27,7 +27,7 @@ from scipy import linalg
 from ..samples.records import Record
 from ..simulation_error.simulation_fit import Realization, simulation_fit
 from .identification import Settings, realize, subspaces_of
-from .realization import ObservabilitySubspace
+from .realization import Subspace
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class _Decimated(NamedTuple):
     """Records sampled less often, and their subspace."""
 
     records: list[Record]
-    subspace: ObservabilitySubspace
+    subspace: Subspace
     highest: int  # order
 
 
@@ -97,7 +97,10 @@ class SlowStarts:
         if not records:
             return None
         settings, height = self._settings, 2 * sum(self._settings.free.direct.shape)
-        room = settings.max_horizon([record.n_samples for record in records])
+        lengths = [record.n_samples for record in records]
+        if settings.too_few(lengths):
+            return None
+        room = settings.max_horizon(lengths)
         horizon = min(_HORIZON, max(2, _MAX_ROWS // height), room)
         highest = min(self._highest, settings.max_order(horizon))
         width = min(highest + settings.n_noise_states, settings.max_order(horizon))

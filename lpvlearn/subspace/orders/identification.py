@@ -30,6 +30,8 @@ from ..simulation_error.simulation_fit import (
 )
 from .realization import (
     ObservabilitySubspace,
+    Subspace,
+    SubspacesApart,
     observability_subspace,
     reflect_unstable,
 )
@@ -64,16 +66,29 @@ class Settings(NamedTuple):
     def max_horizon(self, lengths: Sequence[int]) -> int:
         """Largest horizon whose Hankel columns outnumber its rows (at least 1).
 
-        `lengths` are the samples of every experiment.
+        `lengths` are the samples of every experiment. Of each output alone where they
+        are `too_few` for all together.
         """
-        rows = 2 * sum(self.free.direct.shape)
+        n_outputs, n_inputs = self.free.direct.shape
+        n_channels = n_inputs + (1 if self.too_few(lengths) else n_outputs)
         low, high = 1, max(1, max(lengths) // 2)
         while low < high:  # the number of columns falls with the horizon
             middle = (low + high + 1) // 2
-            n_columns = sum(max(0, n - 2 * middle + 1) for n in lengths)
-            enough = n_columns >= rows * middle
+            enough = _fill(lengths, middle, n_channels)
             low, high = (middle, high) if enough else (low, middle - 1)
         return low
+
+    def too_few(self, lengths: Sequence[int]) -> bool:
+        """Whether samples show states of each output alone, but none of all together.
+
+        That takes a horizon of two.
+
+        >>> settings = Settings(Freedom(np.ones((5, 3), bool)))
+        >>> [settings.too_few([n]) for n in (18, 19, 34, 35)]
+        [False, True, True, False]
+        """
+        n_outputs, n_inputs = self.free.direct.shape
+        return _too_few(lengths, n_inputs, n_outputs)
 
     def max_order(self, horizon: int) -> int:
         """Largest order that a horizon can show of these channels.
@@ -116,6 +131,17 @@ class Settings(NamedTuple):
             )
 
 
+def _fill(lengths: Sequence[int], horizon: int, n_channels: int) -> bool:
+    """Whether Hankel columns outnumber the rows of a horizon."""
+    n_columns = sum(max(0, n - 2 * horizon + 1) for n in lengths)
+    return n_columns >= 2 * n_channels * horizon
+
+
+def _too_few(lengths: Sequence[int], n_inputs: int, n_outputs: int) -> bool:
+    together = _fill(lengths, 2, n_inputs + n_outputs)
+    return not together and _fill(lengths, 2, n_inputs + 1)
+
+
 class Candidate(NamedTuple):
     """A model of scaled records, and how it came about."""
 
@@ -143,12 +169,31 @@ def subspaces_of(
     method: str,
     *,
     cheap: bool = False,
-) -> dict[int, ObservabilitySubspace]:
+) -> Mapping[int, Subspace]:
     """Observability subspace of every horizon, of as many directions as given.
 
     With `cheap` the longer horizons are left out where the samples are so smooth, or so
-    free of noise, that many of them are linearly dependent to working precision.
+    free of noise, that many of them are linearly dependent to working precision. Of
+    samples that are too few for all outputs together each output has its own.
     """
+    m, ny = len(records[0].u), len(records[0].y)
+    if max(widths) == 1 or not _too_few([r.n_samples for r in records], m, ny):
+        return _subspaces_of_all(records, widths, method, cheap=cheap)
+    of_one = {horizon: horizon - 1 for horizon in widths}
+    alone = [
+        _subspaces_of_all([r._replace(y=r.y[[i]]) for r in records], of_one, method)
+        for i in range(ny)
+    ]
+    return {h: SubspacesApart([spaces[h] for spaces in alone]) for h in widths}
+
+
+def _subspaces_of_all(
+    records: Sequence[Record],
+    widths: Mapping[int, int],
+    method: str,
+    *,
+    cheap: bool = False,
+) -> dict[int, ObservabilitySubspace]:
     m, ny = len(records[0].u), len(records[0].y)
     samples = [np.ascontiguousarray(np.vstack((r.u, r.y)).T) for r in records]
     past_outputs, n_trend = method != "pi-moesp", len(records[0].trend)
@@ -166,7 +211,7 @@ def subspaces_of(
 
 
 def realize(
-    subspace: ObservabilitySubspace,
+    subspace: Subspace,
     records: Sequence[Record],
     order: int,
     settings: Settings,
@@ -180,8 +225,14 @@ def realize(
     """
     enforce, free = settings.enforce_stability, settings.free
 
-    def with_inputs(A: Array, C: Array) -> tuple[Array, Array, Array] | None:
-        whole = simulation_fit(A, C, records, free)
+    def with_inputs(
+        A: Array, C: Array, outputs: Sequence[int]
+    ) -> tuple[Array, Array, Array] | None:
+        some, freedom = records, free
+        if len(outputs) < len(free.direct):
+            some = [record._replace(y=record.y[outputs]) for record in records]
+            freedom = free._replace(direct=free.direct[outputs])
+        whole = simulation_fit(A, C, some, freedom)
         return whole[:3] if np.isfinite(whole.loss) else None
 
     ny, n_noise = len(records[0].y), settings.n_noise_states
@@ -299,7 +350,8 @@ def _refitted(
     if not white:
         return candidate.model
     lengths, order = [r.n_samples for r in white], len(candidate.model.A)
-    if candidate.refined or settings.max_horizon(lengths) < candidate.horizon:
+    short = settings.max_horizon(lengths) < candidate.horizon
+    if candidate.refined or short or settings.too_few(lengths):
         model = restarted(candidate.model, whitening, white, free)
         model = refine_simulation(model, white, free, REFITS)
     else:

@@ -8,7 +8,7 @@ matrix; the methods differ in how they weight it (Van Overschee and De Moor, 199
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +21,18 @@ from ..simulation_error.simulation_fit import Freedom
 
 Array = NDArray[np.float64]
 
+# A, B and C of a pair of some outputs; None where it has no model.
+WithInputs = Callable[[Array, Array, Sequence[int]], tuple[Array, Array, Array] | None]
+
 METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva")
 
 # Singular values of the block of past data below this share of the largest are those of
 # unexcited directions in data without noise; so are eigenvalues of the future outputs'
 # covariance, their squares but for rounding, below the second.
 _UNEXCITED, _UNEXCITED_POWER = 1e-10, 1e-12
+
+# Block rows by the order, of a Hankel matrix of the states that outputs have apart
+_LENGTH = 4
 
 _EPSILON = float(np.finfo(float).eps)  # below it a direction is rounding
 
@@ -64,22 +70,63 @@ class ObservabilitySubspace(NamedTuple):
         n_outputs: int,
         order: int,
         n_noise_states: int,
-        with_inputs: Callable[[Array, Array], tuple[Array, Array, Array] | None],
+        with_inputs: WithInputs,
     ) -> tuple[Array, Array]:
         """``(A, C)`` of an order, with noise states of those the inputs reach most.
 
-        `with_inputs` makes A, B and C of the pair of the higher order, or None where
-        that has no model.
+        `with_inputs` makes A, B and C of the pair of the higher order and of outputs,
+        or None where that has no model.
         """
         horizon = len(self.singular_values) // n_outputs
         most = min(self.basis.shape[1], (horizon - 1) * n_outputs)
         extended = min(order + n_noise_states, most)
         if 0 < order < extended:
             A, C = shift_invariant_pair(self.basis, n_outputs, extended)
-            model = with_inputs(reflect_unstable(A), C)
+            model = with_inputs(reflect_unstable(A), C, range(n_outputs))
             if model is not None:
                 return _dominant_pair(*model, order, horizon)
         return shift_invariant_pair(self.basis, n_outputs, order)
+
+
+class SubspacesApart(NamedTuple):
+    """Those of each output alone, for samples too few for all of them together."""
+
+    alone: list[ObservabilitySubspace]
+
+    @property
+    def singular_values(self) -> Array:
+        """All of them, descending."""
+        found = np.concatenate([space.singular_values for space in self.alone])
+        return np.sort(found)[::-1]
+
+    def weighted(self, weight: Array) -> None:
+        """None: those of other outputs are not told by these."""
+
+    def state_pair(
+        self,
+        n_outputs: int,
+        order: int,
+        n_noise_states: int,
+        with_inputs: WithInputs,
+    ) -> tuple[Array, Array]:
+        """``(A, C)`` of the states of all outputs that dominate what the inputs do.
+
+        As of an `ObservabilitySubspace`, but for noise states: the others are such. No
+        output is given more than there are to be.
+        """
+        models = []
+        for i, (basis, *_) in enumerate(self.alone):
+            A, C = shift_invariant_pair(basis, 1, min(order, basis.shape[1]))
+            model = with_inputs(reflect_unstable(A), C, [i])
+            if model is None:  # it overflows
+                return np.zeros((order, order)), np.zeros((n_outputs, order))
+            models.append(model)
+        A, C = (linalg.block_diag(*(model[k] for model in models)) for k in (0, 2))
+        B = np.vstack([model[1] for model in models])
+        return _dominant_pair(A, B, C, order, _LENGTH * order + 1)
+
+
+Subspace = ObservabilitySubspace | SubspacesApart
 
 
 def observability_subspace(

@@ -52,7 +52,7 @@ from .identification import (
     subspaces_of,
     validate,
 )
-from .realization import ObservabilitySubspace
+from .realization import Subspace
 
 Array = NDArray[np.float64]
 
@@ -263,7 +263,7 @@ class _Range(NamedTuple):
     horizon: int | None
     # of the records as they are, for orders up to the highest: by horizon, as found;
     # None for horizons that are left out
-    spaces: dict[int, ObservabilitySubspace | None]
+    spaces: dict[int, Subspace | None]
     starts: dict[tuple[int, int], Realization]  # by order and horizon, as found
     slow: bool = False  # whether decimated records are asked as well
 
@@ -488,7 +488,7 @@ def _relative_errors(
 
 def _look_up(
     wanted: _Range, lowest: int, records: Sequence[Record], settings: Settings
-) -> dict[int, ObservabilitySubspace]:
+) -> dict[int, Subspace]:
     """Subspaces of every horizon that shows the lowest order, known ones or new."""
     horizon, width = wanted.horizon, max(wanted.orders[-1], wanted.pilot)
     width += settings.n_noise_states
@@ -503,11 +503,9 @@ def _look_up(
     return {h: space for h, space in spaces.items() if space is not None}
 
 
-def _weighted(
-    wanted: _Range, whitening: Whitening
-) -> dict[int, ObservabilitySubspace | None]:
+def _weighted(wanted: _Range, whitening: Whitening) -> dict[int, Subspace | None]:
     """The subspaces looked up already, where outputs were weighted and no more."""
-    found = {}
+    found: dict[int, Subspace | None] = {}
     for horizon, space in wanted.spaces.items() if len(whitening.filter) == 1 else ():
         new = None if space is None else space.weighted(whitening.weight)
         if new is not None or space is None:

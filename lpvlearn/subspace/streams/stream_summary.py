@@ -338,7 +338,9 @@ class StreamSummary:
     def _state_pair(self, step: _SubspaceStep) -> tuple[Array, Array]:
         """A and C of the subspace step, in our scale."""
 
-        def with_inputs(A: Array, C: Array) -> tuple[Array, Array, Array]:
+        def with_inputs(
+            A: Array, C: Array, _: Sequence[int]
+        ) -> tuple[Array, Array, Array]:
             # The samples are gone: B by the factor alone.
             factor, horizon = step.factor, self._horizon
             return A, factor_input_matrices(factor, A, C, self._free, horizon)[0], C
