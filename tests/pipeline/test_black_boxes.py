@@ -96,6 +96,7 @@ def vanishing(place, kappas):
     return from_trajectories(runs, sampling_time=STEP)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     ("place", "n_points", "order", "most"),
     [(2, 5, "auto", 0.05), (4, 5, "auto", 0.05), (2, 6, 4, 0.05), (1, 3, "auto", 0.1)],

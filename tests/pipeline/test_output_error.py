@@ -316,6 +316,7 @@ def test_the_progress_bar_tells_the_cost(capsys):
 # -- what the errors tell --------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_of_a_few_samples_is_fitted_with_the_others():
     X, y = sweeps()
     few = X["run"] == "sweep 1"
@@ -373,6 +374,7 @@ def test_constants_that_are_missing_are_told():
     assert not OutputErrorLPV(spring_structure(), **roles).fit(X, y).offsets_.any()
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("gain", [-1.0, 1000.0])
 def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
     """Constants do not stand for it: local experiments hold the model."""

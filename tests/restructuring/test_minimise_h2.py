@@ -112,6 +112,7 @@ def test_infinite_h2_norm_is_refused():
         GrayBoxRestructurer(structure, norm="h2").fit_model(box)
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings("ignore:the values of")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 @pytest.mark.filterwarnings("ignore:the response determines")

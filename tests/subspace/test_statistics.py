@@ -81,6 +81,7 @@ def test_far_prediction_and_white_noise_are_the_simulation(coloured_fit):
     )
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("clean", [1e-4, 1e-6])
 @pytest.mark.parametrize("missing", ["raise", "estimate"])
 def test_a_clean_output_spoils_no_prediction_of_a_noisy_one(clean, missing):
