@@ -206,10 +206,9 @@ def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed, b
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
-def test_a_form_that_misses_its_own_points_is_not_taken(seed):
+def test_a_form_that_misses_its_own_points_is_not_taken():
     """Water in series: so many slow states that covariances say little of them."""
-    rng, trajectories = np.random.default_rng(seed), []
+    rng, trajectories = np.random.default_rng(1), []
     for flow in (1.0, 1.5, 2.2, 3.2):
         rate = 4186.0 * flow / 6e4
         A = rate * np.eye(8, k=-1) - (rate + 1.0 / 6e4) * np.eye(8)

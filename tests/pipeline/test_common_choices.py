@@ -170,10 +170,9 @@ def test_what_drifts_at_some_points_is_looked_for_at_all():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 2])
-def test_points_together_tell_that_outputs_drift(seed):
+def test_points_together_tell_that_outputs_drift():
     """Two tanks, not linear: each point alone has slow states for it, or grows."""
-    rng, X, Y = np.random.default_rng(seed), [], []
+    rng, X, Y = np.random.default_rng(0), [], []
     for run, level in enumerate([1.5, 3.0, 5.0, 8.0]):
         u = 0.45 * np.sqrt(level) + 0.06 * np.repeat(rng.choice([-1.0, 1.0], 20), 20)
         levels, y = np.full(2, level), np.empty(400)

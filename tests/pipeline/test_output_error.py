@@ -362,7 +362,7 @@ def test_experiments_at_rest_begin_there(alone):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable")  # as it is without them
 def test_constants_that_are_missing_are_told():
-    X, y = sweeps()
+    X, y = sweeps(n=1)
     roles = ROLES | {"experiment": "run"}
     off = y + y.std()
     with pytest.warns(UserWarning, match="Use offset='constant'"):
@@ -388,7 +388,7 @@ def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
 
 @pytest.mark.slow
 def test_a_delay_that_is_missing_is_told():
-    X, y = sweeps()
+    X, y = sweeps(n=1)
     roles = ROLES | {"experiment": "run"}
     late = y.groupby(X["run"]).shift(4).fillna(0.0)
     with pytest.warns(UserWarning, match="'position' follow from the inputs.*delay"):
