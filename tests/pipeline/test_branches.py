@@ -318,8 +318,9 @@ def coils_pipeline(structure, memory, refiner=None, **options):
 
 
 @pytest.mark.broad
-@pytest.mark.parametrize("varies", [1, 2])
-@pytest.mark.parametrize("names", [(), ("rotor", "motor", "friction", "load")])
+@pytest.mark.parametrize(
+    "varies, names", [(1, ()), (2, ("rotor", "motor", "friction", "load"))]
+)
 def test_experiments_that_move_choose_among_mirror_images(varies, names, memory):
     """Whatever the names: and so nothing is told (a warning would be an error)."""
     pipeline = coils_pipeline(coils(*names), memory, OutputErrorLPV())

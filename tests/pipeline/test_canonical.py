@@ -190,7 +190,7 @@ def position(u, kappa):
 
 
 @pytest.mark.broad
-@pytest.mark.parametrize("seed, bend", [(0, 1.0), (1, 1.0), (2, 1.0), (0, 3.0)])
+@pytest.mark.parametrize("seed, bend", [(0, 1.0), (0, 3.0)])
 def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed, bend):
     rng = np.random.default_rng(seed)
     X, y = tables(lambda kappa: servo(kappa**bend), 5, noise=0.0)

@@ -501,10 +501,9 @@ def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it(seed):
+def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it():
     """Its inputs are nearly all reference and answers to that."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     plant = StateSpace([[0.0, 1.0], [0.6, -1.7]], [[0.0], [1.0]], [[1.0, 0.0]])
     A, B = (getattr(plant.to_discrete(0.25), M) for M in "AB")
     r = rng.standard_normal(1200)

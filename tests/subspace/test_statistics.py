@@ -185,8 +185,8 @@ def test_jacobians_equal_finite_differences():
 @pytest.mark.slow
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_bands_of_95_percent_cover_the_truth(pole):
-    """Within what 60 runs can tell, entry by entry; 300 runs are a benchmark."""
-    runs = 60
+    """Within what 40 runs can tell, entry by entry; 300 runs are a benchmark."""
+    runs = 40
     hits, pole_hits = [], []
     for seed in range(runs):
         u, y = experiment(seed, 600, pole=pole)
