@@ -18,6 +18,18 @@ ROLES = {"scheduling": "kappa", "experiment": "run", "time": "time"}
 KAPPA = (0.0, 0.5, 1.0, 1.5)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of a test that is `broad` all cases but the first are slow."""
+    seen = set()
+    for item in items:
+        if item.get_closest_marker("broad"):
+            test = item.nodeid.partition("[")[0]
+            if test in seen:
+                item.add_marker(pytest.mark.slow)
+            seen.add(test)
+
+
 def modes(*poles):
     """Real block-diagonal matrix with the given poles, one of each complex pair."""
     return block_diag(

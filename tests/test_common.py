@@ -24,22 +24,39 @@ ESTIMATORS = [
 
 
 # The checks fit tables of independent samples, which no dynamic model explains.
-@pytest.mark.filterwarnings("ignore:The model explains next to nothing")
-@pytest.mark.filterwarnings("ignore:A mode of the model does not")
-@pytest.mark.filterwarnings("ignore:The model simulates parts of the record")
-@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
-@pytest.mark.filterwarnings("ignore:`lpv_` is unstable at values within its range")
-@pytest.mark.filterwarnings("ignore:with a constant of every experiment")
-@pytest.mark.filterwarnings("ignore:the errors of output .* follow from the inputs")
-@parametrize_with_checks(
-    [
-        LocalLPVPipeline(),
-        LocalLPVPipeline(restructurer="passthrough"),
-        LocalLPVPipeline(combine="average", on_error="skip"),
-        OutputErrorLPV(sampling_time=1.0, max_iter=3),
-    ]
+TOLD = (
+    "The model explains next to nothing",
+    "A mode of the model does not",
+    "The model simulates parts of the record",
+    "the structure comes no nearer",
+    "`lpv_` is unstable at values within its range",
+    "with a constant of every experiment",
+    "the errors of output .* follow from the inputs",
 )
+
+
+def common_checks(*estimators):
+    """scikit-learn's checks of estimators; what is TOLD is no error."""
+
+    def decorated(test):
+        for message in TOLD:
+            test = pytest.mark.filterwarnings(f"ignore:{message}")(test)
+        return parametrize_with_checks(estimators)(test)
+
+    return decorated
+
+
+@common_checks(LocalLPVPipeline(), OutputErrorLPV(sampling_time=1.0, max_iter=3))
 def test_common_checks(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.slow
+@common_checks(
+    LocalLPVPipeline(restructurer="passthrough"),
+    LocalLPVPipeline(combine="average", on_error="skip"),
+)
+def test_common_checks_with_options(estimator, check):
     check(estimator)
 
 

@@ -44,10 +44,11 @@ from lpvlearn.datasets import load_flexible_arm
 
 data = load_flexible_arm()
 roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+memory = tempfile.mkdtemp()  # of local and gray-box models, see below
 pipeline = LocalLPVPipeline(
     SubspaceLTI(6, feedthrough=False, horizon=60),
     GrayBoxRestructurer(data.structure),
-    memory=tempfile.mkdtemp(),  # see below
+    memory=memory,
     **roles,
 ).fit(data.X, data.y)
 
@@ -75,7 +76,10 @@ print(pipeline.summary())
 # balanced models without a common structure:
 
 balanced = LocalLPVPipeline(
-    SubspaceLTI(6, feedthrough=False, horizon=60), "passthrough", **roles
+    SubspaceLTI(6, feedthrough=False, horizon=60),
+    "passthrough",
+    memory=memory,
+    **roles,
 ).fit(data.X, data.y)
 compare_models(
     {"restructured": pipeline, "balanced": balanced}, data.X_sweep, data.y_sweep

@@ -55,6 +55,7 @@ def test_one_record_of_levels_is_cut_at_them(folder, tmp_path):
     assert "`--levels` must be a non-negative number" in told[2]
 
 
+@pytest.mark.slow
 def test_levels_of_the_column_that_tells_experiments_apart(tmp_path):
     X, y = spring_tables(n_samples=300)
     log = X.join(y).drop(columns=["run", "time"]).assign(experiment="bench")

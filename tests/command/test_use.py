@@ -58,6 +58,7 @@ def test_report_tells_the_summary_and_writes_a_page(folder, model, tmp_path):
     assert "Measured and simulated" in page.read_text()
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("timed", [False, True])
 def test_several_files_are_experiments_to_a_model_of_one_file(folder, tmp_path, timed):
     table = pd.read_csv(folder / "runs.csv").query("kappa == 0.5")

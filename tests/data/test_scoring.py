@@ -43,6 +43,7 @@ def told_of_motion(model, X, y, scoring):
     return scores, [str(w.message) for w in caught if MOTION in str(w.message)]
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("scoring", [None, bft_scorer])
 def test_folds_that_start_in_mid_motion_are_warned_of(spring, scoring):
     """Four of the five blocks start in the middle."""
@@ -80,6 +81,7 @@ def test_a_level_is_not_taken_for_motion(time_constant):
             model.score(u, y + 1.5 * size * pole ** np.arange(len(y))[:, None])
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 @pytest.mark.filterwarnings("ignore:The simulation error depends on past inputs")

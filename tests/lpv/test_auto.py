@@ -27,6 +27,7 @@ def noisy(truth, rng, deviation=0.01):
     return clean + errors, roots @ roots.swapaxes(1, 2)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("form", TRUTHS)
 def test_the_true_form_is_chosen(form):
     rng = np.random.default_rng(0)
@@ -241,6 +242,7 @@ def test_a_rational_form_that_is_a_cubic_without_a_point_is_not_told_by_that():
         assert model.form_ == "cubic"
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [0, 22, 24, 38])
 def test_squares_of_several_variables_must_foresee_scattered_points(seed):
     """Products of squares, nine for twelve points: they swing between these."""
@@ -312,6 +314,7 @@ def test_entries_that_are_noise_hide_no_law_of_one(seed):
     np.testing.assert_allclose(pole, -0.05 / np.sqrt(between), rtol=0.02)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", range(4))
 def test_a_variable_that_tells_nothing_is_left_out(seed):
     """A supply voltage, say, that is nearly constant; six points tell of no plane."""

@@ -16,16 +16,16 @@ KAPPA = np.linspace(-1, 2, 7)[:, None]
 THETA = np.hstack([2 + KAPPA, 1 - KAPPA**2])
 
 
-@parametrize_with_checks(
-    [
-        RationalLPV(),
-        RationalLPV(1, 1, terms="tensor"),
-        SplineLPV(),
-        SplineLPV("linear"),
-        AutoLPV(),
-    ]
-)
+@parametrize_with_checks([RationalLPV(), SplineLPV()])
 def test_scikit_learns_rules(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.slow
+@parametrize_with_checks(
+    [RationalLPV(1, 1, terms="tensor"), SplineLPV("linear"), AutoLPV()]
+)
+def test_scikit_learns_rules_with_options_and_a_search(estimator, check):
     tensor = getattr(estimator, "terms", "") == "tensor"
     if tensor and "sample_weight_equivalence" in str(check):
         pytest.skip("2^30 terms of its 30 variables")

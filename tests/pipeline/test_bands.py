@@ -158,7 +158,7 @@ def test_the_refiner_hands_its_covariance_and_errors_on(memory):
 def test_errors_are_as_large_as_told():
     new, truth = spring_sweep(400)
     scores = []
-    for seed in range(8):
+    for seed in range(4):
         X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES, seed=seed)
         model = spring_pipeline().fit(X, y)
         std = model.prediction_std(new).xs("parameters", axis=1, level="part")

@@ -219,7 +219,7 @@ def test_choices_are_kept_in_a_memory(tmp_path):
 LAGS = GrayBoxStructure.from_template([["-a", 0], ["a", "-b"]], [["g"], [0]], [[0, 1]])
 
 
-def lags(structure, *, n_points=8, init="similarity"):
+def lags(structure, *, n_points=8, init="similarity", memory=None):
     """Two tanks in series, one of which is 1.5 times as slow at all points."""
     rng = np.random.default_rng(3)
     kappa, outputs, inputs = np.linspace(0.5, 3.0, n_points), [], []
@@ -235,6 +235,7 @@ def lags(structure, *, n_points=8, init="similarity"):
         scheduling=1,
         experiment=1,
         sampling_time=2.0,
+        memory=memory,
     )
     return pipeline.fit(np.vstack(inputs), np.vstack(outputs))
 
@@ -255,9 +256,10 @@ def test_bounds_for_all_parts_leave_one_family():
     modes_pipeline(MODES.with_bounds(bounds)).fit(*modes_tables(range(4)))
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("g", [0.02, 0.03])
 @pytest.mark.parametrize("known", ["range", "bound", "guess"])
-def test_what_is_known_of_them_tells_which_is_which(known, g):
+def test_what_is_known_of_them_tells_which_is_which(known, g, memory):
     interval, structure, init = {"g": (0.8 * g, 1.2 * g)}, LAGS, "similarity"
     if known == "range":
         structure = LAGS.with_ranges(interval)
@@ -267,7 +269,7 @@ def test_what_is_known_of_them_tells_which_is_which(known, g):
         init = [0.02, 0.01, 0.02]
         if g == 0.03:
             init = {"a": 0.01, "b": 0.02, "g": 0.03}
-    found = lags(structure, n_points=4, init=init)
+    found = lags(structure, n_points=4, init=init, memory=memory)
     np.testing.assert_allclose(found.parameters_["g"], g, rtol=0.05)
 
 
@@ -304,21 +306,24 @@ def two_coils(varies, *, n_sweeps, noise=0.01, seed=0, fast=1):
     return from_trajectories(runs, sampling_time=STEP)
 
 
-def coils_pipeline(structure, refiner=None, **options):
+def coils_pipeline(structure, memory, refiner=None, **options):
     return LocalLPVPipeline(
         restructurer=GrayBoxRestructurer(structure, **options),
         refiner=refiner,
+        memory=memory,
         scheduling="kappa",
         experiment="experiment",
         time="time",
     )
 
 
-@pytest.mark.parametrize("varies", [1, 2])
-@pytest.mark.parametrize("names", [(), ("rotor", "motor", "friction", "load")])
-def test_experiments_that_move_choose_among_mirror_images(varies, names):
+@pytest.mark.broad
+@pytest.mark.parametrize(
+    "varies, names", [(1, ()), (2, ("rotor", "motor", "friction", "load"))]
+)
+def test_experiments_that_move_choose_among_mirror_images(varies, names, memory):
     """Whatever the names: and so nothing is told (a warning would be an error)."""
-    pipeline = coils_pipeline(coils(*names), OutputErrorLPV())
+    pipeline = coils_pipeline(coils(*names), memory, OutputErrorLPV())
     pipeline.fit(*two_coils(varies, n_sweeps=1))
     X, y = two_coils(varies, n_sweeps=1, noise=0.0, seed=5)
     fresh = X["experiment"] == X["experiment"].max()
@@ -333,16 +338,16 @@ def test_experiments_that_move_choose_among_mirror_images(varies, names):
 
 
 @pytest.mark.parametrize("names", [(), ("rotor", "motor", "friction", "load")])
-def test_mirror_images_that_nothing_tells_apart_are_told(names):
+def test_mirror_images_that_nothing_tells_apart_are_told(names, memory):
     """Once: what each operating point says of it is not said again."""
     X, y = two_coils(1, n_sweeps=0)
     with pytest.warns(UserWarning, match="make another LPV model") as caught:
-        coils_pipeline(coils(*names)).fit(X, y)
+        coils_pipeline(coils(*names), memory).fit(X, y)
     assert len(caught) == 1
 
 
-def test_a_guess_tells_mirror_images_apart():
-    found = coils_pipeline(coils(), init=[9.0, 6.0, 0.7, 0.5])
+def test_a_guess_tells_mirror_images_apart(memory):
+    found = coils_pipeline(coils(), memory, init=[9.0, 6.0, 0.7, 0.5])
     spread = found.fit(*two_coils(1, n_sweeps=0)).parameters_.std()
     assert spread["l1"] > 10.0 * spread["l2"]
 
@@ -350,19 +355,19 @@ def test_a_guess_tells_mirror_images_apart():
 WRONG_IF_2_VARIES = [9.0, 6.0, 0.7, 0.5]  # a guess, which no frozen model refutes
 
 
-def test_a_refined_model_that_misses_its_own_record_is_told():
-    pipeline = coils_pipeline(coils(), OutputErrorLPV(), init=WRONG_IF_2_VARIES)
+def test_a_refined_model_that_misses_its_own_record_is_told(memory):
+    pipeline = coils_pipeline(coils(), memory, OutputErrorLPV(), init=WRONG_IF_2_VARIES)
     with pytest.warns(UserWarning, match="refined model misses .* in the experiments"):
         pipeline.fit(*two_coils(2, n_sweeps=1, fast=8))
 
 
-def test_a_refined_model_of_a_noisy_record_is_not_said_to_miss_it():
+def test_a_refined_model_of_a_noisy_record_is_not_said_to_miss_it(memory):
     """A warning would be an error."""
-    pipeline = coils_pipeline(coils(), OutputErrorLPV(), init=WRONG_IF_2_VARIES)
+    pipeline = coils_pipeline(coils(), memory, OutputErrorLPV(), init=WRONG_IF_2_VARIES)
     pipeline.fit(*two_coils(1, n_sweeps=1, noise=0.1))
 
 
-def test_parts_that_are_the_same_at_all_points_have_no_mirror_image():
+def test_parts_that_are_the_same_at_all_points_have_no_mirror_image(memory):
     """No state depends on their order then; gains may vary."""
     structure = GrayBoxStructure.from_template(
         A=[["-lag_1", 0], [1, "-lag_2"]], B=[["gain"], [0]], C=[[0, 1]]
@@ -373,7 +378,7 @@ def test_parts_that_are_the_same_at_all_points_have_no_mirror_image():
         plant = structure.model({"lag_1": 0.4, "lag_2": 2.0, "gain": 1.0 + kappa})
         y = plant.simulate(u, sampling_time=STEP)
         runs.append((u, kappa, y + 1e-3 * y.std() * rng.standard_normal(y.shape)))
-    coils_pipeline(structure, init="similarity").fit(
+    coils_pipeline(structure, memory, init="similarity").fit(
         *from_trajectories(runs, sampling_time=STEP)
     )
 

@@ -65,6 +65,7 @@ def pipeline(restructurer=None, **options):
     return LocalLPVPipeline(restructurer=restructurer, **options, **roles)
 
 
+@pytest.mark.slow
 def test_a_low_form_that_foresees_the_points_is_taken():
     X, y = tables(pendulum, 5)
     model, other = pipeline().fit(X, y), pipeline("aligned").fit(X, y)
@@ -80,6 +81,7 @@ def test_a_low_form_that_foresees_the_points_is_taken():
     assert ours > 99.0 > 90.0 > theirs
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("units", [1e-6, 1e5])
 def test_units_do_not_choose(units):
     model = pipeline().fit(*tables(pendulum, 5, units=units))
@@ -90,6 +92,7 @@ def slight_pendulum(kappa):
     return pendulum(0.3 * kappa)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("system, n_points", [(slight_pendulum, 3), (two_modes, 5)])
 def test_where_no_low_form_is_told_black_boxes_are_aligned(system, n_points):
     """Of three points any parabola goes through, and tells nothing."""
@@ -122,6 +125,7 @@ def test_corners_of_two_scheduling_variables_speak_against_no_form():
     assert np.abs(middle.poles()[0]) == pytest.approx(np.sqrt(20.0 / 1.5), rel=0.01)
 
 
+@pytest.mark.slow
 def test_parameters_are_those_of_the_canonical_restructurer():
     X, y = tables(pendulum, 5)
     model, other = pipeline().fit(X, y), pipeline(GrayBoxRestructurer()).fit(X, y)
@@ -150,6 +154,7 @@ def test_a_curve_through_the_points_is_one_through_aligned_models():
     assert list(model.parameters_)[0] == "a1_1"
 
 
+@pytest.mark.slow
 def test_experiments_that_move_choose_the_states():
     """Three points tell of no form; what moves tells which states follow it."""
     X, y = spring_tables(noise=0.01, kappas=(0.0, 0.75, 1.5))
@@ -184,7 +189,8 @@ def position(u, kappa):
     return np.array(drive)
 
 
-@pytest.mark.parametrize("seed, bend", [(0, 1.0), (1, 1.0), (2, 1.0), (0, 3.0)])
+@pytest.mark.broad
+@pytest.mark.parametrize("seed, bend", [(0, 1.0), (0, 3.0)])
 def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed, bend):
     rng = np.random.default_rng(seed)
     X, y = tables(lambda kappa: servo(kappa**bend), 5, noise=0.0)
@@ -200,10 +206,9 @@ def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed, b
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
-def test_a_form_that_misses_its_own_points_is_not_taken(seed):
+def test_a_form_that_misses_its_own_points_is_not_taken():
     """Water in series: so many slow states that covariances say little of them."""
-    rng, trajectories = np.random.default_rng(seed), []
+    rng, trajectories = np.random.default_rng(1), []
     for flow in (1.0, 1.5, 2.2, 3.2):
         rate = 4186.0 * flow / 6e4
         A = rate * np.eye(8, k=-1) - (rate + 1.0 / 6e4) * np.eye(8)

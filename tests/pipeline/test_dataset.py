@@ -35,6 +35,7 @@ def assert_same_fit(one, other):
     assert [*one.feature_names_in_] == [*other.feature_names_in_]
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     X, y = tables
@@ -57,6 +58,7 @@ def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     assert found.predict(table[X.columns]).ndim == 1
 
 
+@pytest.mark.slow
 def test_a_dataset_of_arrow_is_one(tables):
     pa, arrow = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.dataset")
     X, y = tables

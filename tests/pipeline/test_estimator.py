@@ -84,6 +84,7 @@ def test_rows_of_experiments_may_be_interleaved(fitted, spring):
     np.testing.assert_array_equal(fitted.predict(mixed), expected)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_realizations_are_pooled_or_averaged(combine):
     X, y = spring_tables(noise=0.03, n_samples=300, n_repeats=4)
@@ -400,6 +401,7 @@ def test_motion_seen_in_local_experiments_is_within_the_range():
     assert -0.15 < low < -0.02 and 1.52 < high < 1.65
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("kappa", [0.0, 0.5])
 def test_one_operating_point_with_noise_is_a_time_invariant_model(kappa):
     X, y = spring_tables(kappas=(0.5,), n_repeats=2)
@@ -506,6 +508,7 @@ def test_html_shows_the_steps_before_and_after_fitting(fitted):
     assert "PolynomialLPV" in nested._repr_html_()
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     X, y = spring_tables(n_repeats=2)
@@ -611,6 +614,7 @@ def test_a_prediction_that_diverges_names_the_experiment(spring):
         model.predict(far)
 
 
+@pytest.mark.slow
 def test_time_may_come_from_the_local_estimator_or_be_counted_in_samples(spring):
     X, y, _, _ = spring
     bare = X.drop(columns="time")
@@ -773,6 +777,7 @@ def test_delays_go_along_with_the_options(options):
     np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_points_tell_a_delay_together():
     """A furnace at four throughputs: short records, each of which tells another one."""
     rng, parts, dt = np.random.default_rng(0), [], 30.0
@@ -863,6 +868,7 @@ def test_a_restructurer_in_the_first_place_is_named():
         wrong.fit(X, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("structured", [True, False])
 def test_points_of_work_are_where_drifts_begin(structured):
     """Of outputs that drift by as much as they move, about a level."""

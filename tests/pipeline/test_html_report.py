@@ -128,6 +128,7 @@ def test_a_table_without_its_outputs_is_refused(fitted, spring, tmp_path):
     assert path.read_text() == "the old one"
 
 
+@pytest.mark.slow
 def test_names_are_text_and_warnings_are_kept_with_their_remedies(tmp_path, spring):
     X, y = spring[:2]
     X = X.rename(columns={"force": "<b>F</b>"})

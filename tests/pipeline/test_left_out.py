@@ -35,6 +35,7 @@ def said(pipeline, X, y):
     return " ".join(str(w.message) for w in found)
 
 
+@pytest.mark.slow
 def test_a_point_that_is_unlike_the_others_is_told(tables):
     """One sensor with the other sign, which no form of the parameters explains."""
     X, y = tables
@@ -47,6 +48,7 @@ def test_a_point_that_is_unlike_the_others_is_told(tables):
     assert "operating point 2 (scheduling 1) has the reverse sign" in words
 
 
+@pytest.mark.slow
 def test_a_wrong_value_of_few_points_is_told():
     X, y = spring_tables(noise=1e-2, n_samples=300, kappas=[0.0, 0.5, 1.0, 1.5, 2.0])
     assert said(spring_pipeline(), X, y) == ""
@@ -54,6 +56,7 @@ def test_a_wrong_value_of_few_points_is_told():
     assert "do not foresee point(s) 3 (scheduling 1.75" in said(spring_pipeline(), X, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("together", [True, False])
 def test_scheduling_variables_that_move_together_are_told(tables, together):
     X, y = tables

@@ -121,6 +121,7 @@ def test_realisations_in_a_loop_have_the_states_of_their_load():
     assert error < 0.6 * error_at_order_two(records, truth, **options)[1]
 
 
+@pytest.mark.slow
 def test_a_state_that_alternates_with_the_noise_is_left_out():
     # the fast one of four lags hardly shows: a fourth state follows the noise
     rates = np.array([0.5, 0.7, 1.0, 6.0])
@@ -175,6 +176,7 @@ def test_a_plant_that_grows_is_no_integrator():
     assert "integrate" not in str(refused.value)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("noise", [1e-4, 1e-2])
 def test_a_structure_may_integrate_twice(noise):
     """Estimates of the poles grow at some points, and nobody has to name the output."""

@@ -13,7 +13,12 @@ import pandas as pd
 import pytest
 from joblib import Memory
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, PolynomialLPV
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    PolynomialLPV,
+    SubspaceLTI,
+)
 from lpvlearn.pipeline.running.memory import fingerprint
 from lpvlearn.pipeline.running.runner import PointRunner
 
@@ -21,7 +26,9 @@ from ..conftest import spring_pipeline, spring_structure, spring_tables
 
 CALLS = []
 
-line_pipeline = partial(spring_pipeline, interpolator=PolynomialLPV(1))
+line_pipeline = partial(
+    spring_pipeline, local=SubspaceLTI(2, horizon=8), interpolator=PolynomialLPV(1)
+)
 
 
 def square(x, note=None):

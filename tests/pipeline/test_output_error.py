@@ -318,6 +318,7 @@ def test_the_progress_bar_tells_the_cost(capsys):
 # -- what the errors tell --------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_of_a_few_samples_is_fitted_with_the_others():
     X, y = sweeps()
     few = X["run"] == "sweep 1"
@@ -363,7 +364,7 @@ def test_experiments_at_rest_begin_there(alone):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable")  # as it is without them
 def test_constants_that_are_missing_are_told():
-    X, y = sweeps()
+    X, y = sweeps(n=1)
     roles = ROLES | {"experiment": "run"}
     off = y + y.std()
     with pytest.warns(UserWarning, match="Use offset='constant'"):
@@ -375,6 +376,7 @@ def test_constants_that_are_missing_are_told():
     assert not OutputErrorLPV(spring_structure(), **roles).fit(X, y).offsets_.any()
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("gain", [-1.0, 1000.0])
 def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
     """Constants do not stand for it: local experiments hold the model."""
@@ -388,7 +390,7 @@ def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
 
 @pytest.mark.slow
 def test_a_delay_that_is_missing_is_told():
-    X, y = sweeps()
+    X, y = sweeps(n=1)
     roles = ROLES | {"experiment": "run"}
     late = y.groupby(X["run"]).shift(4).fillna(0.0)
     with pytest.warns(UserWarning, match="'position' follow from the inputs.*delay"):

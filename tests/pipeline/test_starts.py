@@ -30,7 +30,7 @@ from .conftest import FINE, sweeps
 @pytest.mark.slow
 @pytest.mark.parametrize("form", [None, RationalLPV(2, 1), SplineLPV("cubic")])
 def test_from_a_time_invariant_model_of_the_table(form):
-    X, y = sweeps(noise=0.0, n_samples=600)
+    X, y = sweeps(noise=0.0, n_samples=400)
     model = OutputErrorLPV(spring_structure(), interpolator=form, rate=False, **ROLES)
     model.fit(X, y)
     assert (model.report_["start_BFT"] < 60).all()

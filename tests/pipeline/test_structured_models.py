@@ -191,6 +191,7 @@ TWO_LAGS = GrayBoxStructure.from_template(
 )
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings(
     "ignore:the (structure|search for|parameters|intervals|values of)"
 )
@@ -222,6 +223,7 @@ def servo(kappa):
     return StateSpace(A, [[0], [0], [6.0]], [[1, 0, 0], [0, 0, 1]])
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     "restructurer", ["aligned", "passthrough", GrayBoxRestructurer()], ids=str
 )
@@ -246,6 +248,7 @@ def test_integrators_need_no_structure(restructurer):
     assert scorer(pipeline, X, y) > 99.99
 
 
+@pytest.mark.slow
 def test_one_order_with_integrators_is_that_of_all_points():
     """Two points need a state behind the integrator, the third needs two."""
     rng, runs = np.random.default_rng(4), []

@@ -47,6 +47,7 @@ def fitted(structure, model, **options):
     return fit, [str(warning.message) for warning in told]
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("options", [{}, {"norm": "h2"}])
 def test_more_time_never_makes_worse_and_too_little_is_told(monkeypatch, options):
     structure, model = black_box()

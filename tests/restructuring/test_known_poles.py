@@ -326,6 +326,7 @@ AXES = template(
 EYE = np.eye(5)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     ("structure", "values", "positions", "centres"),
     [

@@ -353,6 +353,7 @@ def identified(structure, u, y, start, step, **options):
     return fit(structure, fitted.lti_.to_continuous(), pairs, start)[0]
 
 
+@pytest.mark.slow
 def test_a_true_structure_has_costs_of_a_chi_square():
     found = [
         identified(LAG, *lag_record(seed), np.array([0.8, 1.5]), STEP, order=1)

@@ -108,6 +108,7 @@ def test_a_failed_quadratic_program_is_warned_about(solver, monkeypatch):
     assert any("quadratic program of a step had no" in str(w.message) for w in caught)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("solver", list(SOLVERS))
 def test_a_saddle_is_left_along_its_negative_curvature(solver):
     """Of two lags that are equal, no gradient tells which shall be the fast one."""
@@ -170,6 +171,7 @@ def test_how_far_a_search_converged_is_said():
     assert fitted.convergence_ == "no"
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.filterwarnings("ignore:the response determines")
 @pytest.mark.parametrize("seed", range(3))
@@ -211,6 +213,7 @@ def beside_a_resonance(seed):
     return StateSpace(A, B, own.C + size * rng.normal(size=(1, 2)))
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", range(4))
 def test_a_search_that_comes_down_to_the_floor_is_at_an_optimum(seed):
     box = beside_a_resonance(seed)

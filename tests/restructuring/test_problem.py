@@ -26,6 +26,7 @@ def test_feedthrough_that_the_structure_lacks_is_reported():
     )
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("kind", ["band", "scalar", "matrix"])
 def test_weighted_error_is_the_norm_of_the_weighted_difference(kind, rough):
     black_box, plain = far_fit(2)
@@ -202,6 +203,7 @@ def test_units_out_of_range_are_told():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::lpvlearn.exceptions.RankWarning")
 def test_a_form_of_many_states_ends_where_its_coefficients_do():
     """What is left is rounding, though far above that of a response."""

@@ -89,6 +89,7 @@ def undamped_masses():
     )
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     "structure",
     [
@@ -259,8 +260,9 @@ def network(name, size, seed=0):
     return structure, model, StateSpace(A, B, C, model.D).balance()
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("size", [1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("size", [1e-4, 5e-3])
 @pytest.mark.parametrize("positive", [False, True])
 def test_noise_on_inputs_of_one_state_leaves_a_start(name, size, positive):
     """The gray box is no farther from the black box than the truth is."""

@@ -156,6 +156,7 @@ def test_the_order_of_parts_in_series_is_another_model_if_one_varies():
     assert change(actuator=2.0) > 0.1
 
 
+@pytest.mark.slow
 def test_how_much_motion_tells_is_the_difference_after_a_jump():
     """By simulation: impulses before it, the responses behind it."""
     family = np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 9.0]])

@@ -85,6 +85,7 @@ def test_inputs_in_open_loop_are_no_answers(noise, direct, digits):
         assert answering_input([pair]) is None, kind
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("digits", [None, 2])
 @pytest.mark.parametrize("options", [{}, {"method": "pbsid"}, {"feedthrough": False}])
 def test_the_fit_tells_that_the_model_is_the_controllers(options, digits):

@@ -27,7 +27,7 @@ def step_test(seed, first=0.0, level=20.0, n=240, at=25, noise=0.01, decay=0.0):
 def test_step_tests_tell_the_static_gain(first, order):
     """Free states and a constant would balance each other until the step comes."""
     errors = []
-    for seed in range(4):
+    for seed in range(2):
         u, y, gain = step_test(seed, first)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -43,7 +43,7 @@ def test_step_tests_tell_the_static_gain(first, order):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of states that noise has
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_rest_that_is_said_may_be_where_inputs_go_on_slowly(seed):
     """A zone that is heated, and the temperature outdoors."""
     rng = np.random.default_rng(seed)
@@ -70,7 +70,7 @@ def test_a_level_of_zero_is_no_constant():
 @pytest.mark.slow
 def test_records_in_mid_motion_do_not_begin_at_rest():
     """Their inputs stand still, their outputs move on."""
-    for seed in range(4):
+    for seed in range(2):
         u, y, _ = step_test(seed, n=600, noise=0.003, decay=20.0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -79,7 +79,7 @@ def test_records_in_mid_motion_do_not_begin_at_rest():
 
 @pytest.mark.slow
 def test_a_logger_that_begins_soon_before_the_step_is_none_the_worse():
-    for seed in range(4):
+    for seed in range(2):
         u, y, gain = step_test(seed, at=3)
         model = SubspaceLTI().fit(u, y)
         np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.1)
@@ -121,7 +121,7 @@ def heater(seed, size=10.0, first=36.0, n=310):
     return u, np.round(16.0 * y) / 16.0, gain
 
 
-HEATERS = [heater(seed, size) for seed, size in enumerate([5.0, 10.0, 15.0, 20.0])]
+HEATERS = [heater(seed, size) for seed, size in enumerate([5.0, 10.0])]
 
 
 def gains(heaters=HEATERS, **options):
@@ -157,6 +157,7 @@ def test_rest_that_is_said_is_at_the_first_inputs():
         np.testing.assert_allclose(one.lti_.poles(), model.lti_.poles(), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_rest_at_zero_is_kept_where_outputs_move_at_once():
     """The first inputs are a step from zero."""
     for rng in map(np.random.default_rng, range(4)):
@@ -168,6 +169,7 @@ def test_rest_at_zero_is_kept_where_outputs_move_at_once():
         assert not model.input_offset_.any() and not model.steady_start_
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("hold", [8, 15, 30])
 def test_rest_at_zero_is_kept_while_a_dead_time_hides_the_first_inputs(hold):
     """A step from zero, of which outputs show nothing before the inputs move again."""
@@ -199,7 +201,7 @@ def test_every_experiment_says_where_it_rests_whichever_comes_first():
 def test_a_missing_output_takes_nothing_of_the_gain():
     for k, (u, y, gain) in enumerate(HEATERS):
         y = y.copy()
-        y[[5, 40, 90, 200][k]] = np.nan
+        y[[5, 40][k]] = np.nan
         model = SubspaceLTI(2, feedthrough=False, missing="estimate").fit(u, y)
         np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.1)
 
@@ -255,9 +257,10 @@ def test_short_records_in_motion_are_not_held_where_some_stand_by_chance(seed):
     assert not model.fit(X, np.vstack(outputs)).steady_start_
 
 
-@pytest.mark.parametrize("level", [0.0, 5.0])
-@pytest.mark.parametrize("pause", [0, 2])
-@pytest.mark.parametrize("width", [1, 4])
+@pytest.mark.broad
+@pytest.mark.parametrize(
+    "width, pause, level", [(1, 0, 0.0), (1, 2, 5.0), (4, 0, 5.0), (4, 2, 0.0)]
+)
 def test_records_begin_with_an_impact(width, pause, level):
     """Free states would take its answer, of a resonance that rings for the record."""
     A, B = np.array([[0.97, 0.2], [-0.2, 0.97]]), np.array([[0.0], [1.0]])

@@ -39,6 +39,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("method", ["auto", "po-moesp"])
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_system_that_changes_is_told(change, method):
@@ -47,6 +48,7 @@ def test_a_system_that_changes_is_told(change, method):
         SubspaceLTI(method=method, sampling_time=STEP).fit(u, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("pole", [0.0, 0.9, 0.99, 1.0])
 def test_noise_is_no_change(pole):
     """Slow noise is followed by trends and initial states of parts."""
@@ -72,6 +74,7 @@ def test_an_input_that_bends_is_no_noise_that_moves_the_plant(bend):
         SubspaceLTI(sampling_time=STEP).fit(u, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("initial_state", ["estimate", "rest"])
 def test_parts_begin_in_mid_motion_whatever_the_record_does(initial_state):
     """Slow poles: what moves from before is most of a part."""

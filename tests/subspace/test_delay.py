@@ -292,6 +292,7 @@ def test_delays_are_found_and_none_is_imagined(kind, direct):
         np.testing.assert_array_equal(found, [delay])
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("delay", [30, 31, 60])
 def test_long_delays_are_looked_for_where_no_input_answers_before(delay):
     rng = np.random.default_rng(5)
@@ -397,6 +398,7 @@ def test_first_answers_need_evidence_for_each_input():
 # -- refused ---------------------------------------------------------------------
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(("order", "start"), [("auto", "estimate"), (2, "rest")])
 def test_a_delay_that_nobody_asked_for_is_told(order, start):
     rng = np.random.default_rng(0)

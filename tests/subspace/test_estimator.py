@@ -140,6 +140,7 @@ def test_single_output_predicts_one_dimension(rng):
     assert SubspaceLTI(1).fit(u, y).predict(u).shape == (200, 1)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("horizon", [15, 30])
 def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(horizon):
     scores = []
@@ -159,18 +160,17 @@ def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(hor
 @pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
 @pytest.mark.parametrize("refine", [True, False])
 def test_automatic_horizon_is_as_good_as_the_best_of_a_full_scan(method, refine):
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        system, u, y = arm_like(rng)
-        _, v, z = arm_like(np.random.default_rng(1000 + seed))
-        y = noisy(y, 30, rng)
-        options = {"method": method, "refine": refine}
-        auto = bft(z, SubspaceLTI(6, **options).fit(u, y).predict(v)).mean()
-        scan = [
-            bft(z, SubspaceLTI(6, horizon=h, **options).fit(u, y).predict(v)).mean()
-            for h in (40, 80, 120)
-        ]
-        assert auto > max(scan) - 0.3
+    rng = np.random.default_rng(0)
+    _, u, y = arm_like(rng)
+    _, v, z = arm_like(np.random.default_rng(1000))
+    y = noisy(y, 30, rng)
+    options = {"method": method, "refine": refine}
+    auto = bft(z, SubspaceLTI(6, **options).fit(u, y).predict(v)).mean()
+    scan = [
+        bft(z, SubspaceLTI(6, horizon=h, **options).fit(u, y).predict(v)).mean()
+        for h in (40, 80, 120)
+    ]
+    assert auto > max(scan) - 0.3
 
 
 @pytest.mark.slow

@@ -171,7 +171,7 @@ def test_experiments_that_start_at_rest_have_zero_initial_states(rng):
 def test_knowing_that_short_experiments_start_at_rest_helps(rng):
     errors = {"rest": [], "estimate": []}
     truth, omega = StateSpace(*SYSTEM, 1.0), np.linspace(0.05, 3.0, 20)
-    for _ in range(8):
+    for _ in range(4):
         runs = [record(rng, 4) for _ in range(60)]
         X = np.vstack(
             [np.column_stack([u, np.full(4, k)]) for k, (u, _) in enumerate(runs)]
@@ -321,6 +321,7 @@ def slow_in_slow_noise(seed):
     return u, y + lfilter([0.3], [1.0, -0.97], rng.standard_normal(u.shape), axis=0)
 
 
+@pytest.mark.slow
 def test_a_static_gain_that_is_not_known_is_told():
     n_told = 0
     for seed in range(10):
@@ -402,6 +403,7 @@ def test_outputs_sampled_more_slowly_than_the_table_are_told():
         SubspaceLTI().fit(u, np.repeat(y[::3], 3, axis=0))
 
 
+@pytest.mark.slow
 def test_an_output_at_its_limit_is_told():
     rng = np.random.default_rng(0)
     u = lfilter([0.3], [1.0, -0.9], rng.standard_normal((600, 1)), axis=0)
@@ -433,6 +435,7 @@ def test_a_sensor_that_hangs_is_told():
     SubspaceLTI(1, missing="estimate").fit(u, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("fallen, length", [(0.0, 3), (-999.0, 1)])
 def test_a_sensor_that_drops_out_is_told(fallen, length):
     rng = np.random.default_rng(0)
@@ -509,6 +512,7 @@ def test_a_coarse_sensor_whose_model_moves_within_a_step_is_at_no_limit():
     SubspaceLTI().fit(u, y)  # silently
 
 
+@pytest.mark.slow
 def test_a_decay_that_is_not_known_is_told():
     n_told = 0
     for seed in range(2):
@@ -539,6 +543,7 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
         assert sum("far worse" in str(w.message) for w in told) == expected
 
 
+@pytest.mark.slow
 def test_a_mode_whose_decay_is_not_known_is_told():
     """Beside noise that drifts; a slow pole that is known is none of these."""
     told = []
@@ -663,6 +668,7 @@ def test_inputs_that_were_logged_wrongly_are_told(rng):
     np.testing.assert_allclose(poles_of(model), POLES, atol=1e-2)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("level", [0.0, 5.0])
 def test_an_output_that_never_changes_is_told(rng, level):
     u, y = record(rng, 800)

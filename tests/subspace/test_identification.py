@@ -178,6 +178,7 @@ def test_a_model_of_whitened_errors_that_the_likelihood_refutes_is_astray(rng):
     assert not _is_astray(plain, plain, [record], settings)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of what is not linear
 def test_what_fits_small_motions_alone_does_not_pass_for_the_model():
     """Its whitened errors are small where little moves, which is most of the record."""

@@ -73,6 +73,7 @@ def test_several_experiments_are_not_joined():
     np.testing.assert_allclose(poles, [-3.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_the_fit_before():
     u, y = record(noise=0.01)
     local = SubspaceLTI(1, sampling_time=STEP).fit(u, y)
@@ -146,6 +147,7 @@ ANGLE = GrayBoxStructure.from_template([[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0
 ROLES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("efficient", [False, True])
 def test_a_servo_from_data_to_the_lpv_model(efficient):
     X, y = servo_tables()
@@ -201,6 +203,7 @@ def test_positions_begin_where_those_of_the_fit_did():
     assert level.begun_state_ is None
 
 
+@pytest.mark.slow
 def test_the_rates_of_a_loop_keep_what_acts_at_once():
     """Rates hold the input of their first sample, whatever a controller does."""
     friction, gain, n = 2.8, 7.0, 3000
@@ -227,6 +230,7 @@ def test_the_rates_of_a_loop_keep_what_acts_at_once():
     np.testing.assert_allclose(static, ratio, rtol=0.3)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [0, 1])
 def test_differenced_noise_of_a_sensor_moves_no_plant(seed):
     """It would be taken for states, or for what a loop answers."""
@@ -269,6 +273,7 @@ def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
     assert not any("drops out" in str(one.message) for one in caught)
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings("ignore:The inputs know the noise")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_controller_that_answers_at_once_is_no_feedthrough_of_the_others(seed):

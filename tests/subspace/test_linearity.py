@@ -40,6 +40,7 @@ def behind_play(signal, radius):
     return np.array(places)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("at_input", [True, False])
 @pytest.mark.parametrize("smooth", [True, False])
 def test_a_fit_tells_of_backlash(at_input, smooth):
@@ -73,6 +74,7 @@ def told_of(u, y):
     return [str(one.message) for one in told]
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("rate", [0.05, 0.15])
 @pytest.mark.parametrize("pole", [0.9 + 0.2j, 0.7 + 0.1j])
 def test_a_fit_tells_of_an_actuator_of_limited_rate(rate, pole):
@@ -126,6 +128,7 @@ def has_two_wells(x):
     return -x + 3.0 * x**3
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     "pushes_back, level, seed",
     [(stiffens, 0.5, 0), (stiffens, 1.5, 1), (has_two_wells, 0.3, 0)],
@@ -136,6 +139,7 @@ def test_of_what_no_linear_model_explains_the_bend_is_told(pushes_back, level, s
         SubspaceLTI().fit(u, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("level, seed", [(0.015, 0), (0.05, 1), (0.1, 3)])
 def test_a_spring_that_stiffens_is_not_taken_for_friction(level, seed):
     with pytest.warns(UserWarning, match="follows? squares or cubes"):
@@ -168,6 +172,7 @@ def test_noise_that_is_not_gaussian_bends_no_linear_system():
         assert find_bend(SubspaceLTI(1, horizon=8).fit(u, y)._evidence) is None
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
 def test_no_noise_makes_a_linear_system_seem_bent(noise):
     for seed in range(4):

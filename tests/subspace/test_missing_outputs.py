@@ -73,9 +73,8 @@ def test_without_noise_the_system_is_found():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", [0.0, 0.9])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_third_of_the_outputs_is_hardly_missed(seed, colour):
-    true, u, y = record(seed, colour=colour)
+def test_a_third_of_the_outputs_is_hardly_missed(colour):
+    true, u, y = record(0, colour=colour)
     whole = SubspaceLTI().fit(u, y)
     model = SubspaceLTI(missing="estimate").fit(u, without(y, 0.3))
     assert model.order_ == 4
@@ -231,6 +230,7 @@ def test_an_output_that_is_never_there():
         SubspaceLTI(2, horizon=6, missing="estimate").fit(u, y)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("n_lost", [20, 300, 700])
 @pytest.mark.parametrize("outputs", ["one", "all"])
 def test_outputs_that_begin_late(n_lost, outputs):
@@ -305,7 +305,7 @@ def test_nothing_is_left_after_a_delay():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "every"), [(1, 2), (1, 3), (2, 4)])
+@pytest.mark.parametrize(("seed", "every"), [(1, 2), (2, 4)])
 def test_the_order_of_outputs_that_come_seldom_is_that_of_what_is_there(seed, every):
     """Completed samples ask for states of their own, and look like a loop."""
     rng = np.random.default_rng(seed)

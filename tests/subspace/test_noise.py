@@ -131,6 +131,7 @@ def test_white_errors_of_missing_outputs_are_zero():
     np.testing.assert_array_equal(left[~missing], errors[~missing])
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("gaps", ["at random", "in a rhythm"])
 def test_the_noise_of_errors_that_are_partly_known(gaps):
     e = np.random.default_rng(0).standard_normal((20000, 1))

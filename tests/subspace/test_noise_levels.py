@@ -43,6 +43,7 @@ def test_collinear_inputs_and_a_short_experiment_are_no_obstacle():
     assert np.linalg.norm(error) < 5e-3 * np.linalg.norm(exact)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("noises, sizes", [([0.05, 2.0], [1, 1]), ([0.1, 2], [1, 20])])
 def test_a_noisy_experiment_spoils_nothing(noises, sizes):
     """A scaled experiment is one of a linear system as well: the model is the same."""

@@ -139,8 +139,9 @@ def test_a_drift_that_a_simulation_misses_is_told(rng):
     )
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings("ignore:Output . drifts along a line")
-@pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("size", [0.1, 1.0])
 def test_a_given_order_does_not_hide_a_drift(rng, size):
     """It has no state left to follow it."""
     X, y = table(rng, levels=(0.0,), n=600, noise=0.1, drift=size * 3.0)
@@ -215,6 +216,7 @@ def test_a_gain_has_a_constant(rng):
     np.testing.assert_allclose(model.predict(u), 3.0 * u + 2.0)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", range(3))
 def test_a_constant_is_cheaper_than_an_integrator(seed):
     """In slow noise a pole at one follows that as well, and simulates nothing."""
@@ -303,7 +305,7 @@ def test_data_about_zero_stay_as_they_are(rng):
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_constants_that_are_not_there_are_hardly_ever_found(pole):
     found = 0
-    for seed in range(60):
+    for seed in range(30):
         X, y = table(
             np.random.default_rng(seed), levels=(0.0,) * 3, noise=0.5, pole=pole
         )
@@ -316,7 +318,7 @@ def test_constants_that_are_not_there_are_hardly_ever_found(pole):
         drifts = none._evidence.whitening.of_differences
         if auto.offset_ is None and not drifts:
             np.testing.assert_array_equal(auto.lti_.A, none.lti_.A)
-    assert found <= 2
+    assert found <= 1
 
 
 @pytest.mark.slow
@@ -324,7 +326,7 @@ def test_constants_that_are_not_there_are_hardly_ever_found(pole):
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_constants_of_the_size_of_the_noise_are_found(pole):
     errors = {"auto": [], "constant": [], None: []}
-    for seed in range(8):
+    for seed in range(4):
         X, y = table(
             np.random.default_rng(seed), levels=(2.0, -2.0, 3.0), noise=0.5, pole=pole
         )
@@ -337,6 +339,7 @@ def test_constants_of_the_size_of_the_noise_are_found(pole):
     assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(("seed", "offset"), [(0, "constant"), (2, "linear")])
 def test_constants_are_seen_through_noise_of_long_memory(seed, offset):
     """Of another output, too: they are many times what that noise moves."""
@@ -352,6 +355,7 @@ def test_constants_are_seen_through_noise_of_long_memory(seed, offset):
     assert (model.order_, model.offset_) == (1, offset)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("level", [0.3, 5.0, -300.0])
 def test_a_level_is_no_drift(rng, level):
     u = rng.choice([-1.0, 1.0], (150, 1)).repeat(10, axis=0)
@@ -414,7 +418,7 @@ def fit_of(model, X, y):
     "options", [{}, {"order": 2}, {"order": 1, "integrating": True}]
 )
 def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         u, fresh = held(rng, 1500), held(rng, 1000)
         y = driven(u) + 0.01 * rng.standard_normal(u.shape)
@@ -431,7 +435,7 @@ def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
 @pytest.mark.parametrize("every", [1, 10])
 def test_a_drift_is_not_followed_by_a_state(size, every):
     """A mode that does not decay would follow it, and go on where inputs drive it."""
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         u, fresh = held(rng, 1000, every), held(rng, 500, every)
         y, there = (
@@ -451,7 +455,7 @@ def test_a_ramp_that_an_early_step_makes_of_an_integrator_is_no_drift():
     """As a line it would be as likely: inputs that explain it have the first word."""
     f = np.sign(np.sin(6 * np.pi * np.arange(300) / 300 + 1e-9))[:, None]
     u = (np.arange(300) >= 15).astype(float)[:, None]
-    for seed in range(1, 4):
+    for seed in range(1, 3):
         rng = np.random.default_rng(seed)
         y = driven(u, bias=0.0)
         noisy = y + 0.03 * y.std() * rng.standard_normal(y.shape)
@@ -474,7 +478,7 @@ def test_offsets_of_the_input_of_several_experiments_differ():
 @pytest.mark.slow
 def test_a_slow_plant_that_begins_at_rest_is_predicted_from_there():
     """The constant alone does not tell where it rests: far from all it has reached."""
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         u, fresh = held(rng, 1500), held(rng, 1000)
         y = driven(u, slow=1.0 - 1.0 / 3000)
@@ -485,7 +489,7 @@ def test_a_slow_plant_that_begins_at_rest_is_predicted_from_there():
 
 @pytest.mark.slow
 def test_a_slow_plant_rests_where_it_began_not_at_the_means_of_its_inputs():
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         u, fresh = held(rng, 4000), held(rng, 1000)
         y = 20.0 + driven(u, slow=0.999, bias=0.0)
@@ -511,6 +515,7 @@ def test_a_step_from_rest_at_a_level_has_a_constant(seed):
     assert model.lti_.dc_gain().item() == pytest.approx(0.5, rel=0.3)  # without: 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of searches that end elsewhere
 def test_what_stands_still_is_at_rest_in_a_model_that_explains_it():
     """A start at a level, for which a model without constants needs a coincidence.
@@ -565,6 +570,7 @@ def test_short_step_responses_are_not_spoilt():
         )
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [5, 9, 40])
 def test_a_step_test_about_a_level_has_a_constant(seed):
     """Slow lags, of which the record does not tell whether their line meets zero."""
@@ -589,6 +595,7 @@ def test_a_step_test_about_a_level_has_a_constant(seed):
     assert fit_of(model, inputs, fresh + level) > 0.9
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", range(3))
 def test_the_level_of_an_integrators_input_is_no_second_integrator(seed):
     """Beside a pole next to one its constant is far beyond all outputs."""
@@ -683,6 +690,7 @@ def test_constants_are_found_far_from_zero(rng, level):
     assert error_of(model) < 0.1
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("level", [6.0, None])
 def test_constants_of_what_stays_far_from_zero_are_taken_in_slow_noise(level):
     """The gain explains means as well, at 1.5 instead of 2: the noise hides that.
@@ -705,6 +713,7 @@ def test_constants_of_what_stays_far_from_zero_are_taken_in_slow_noise(level):
     np.testing.assert_allclose(np.mean(gains), 2.0, atol=0.2)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_drift_does_not_hide_constants_far_from_zero(seed):
     rng = np.random.default_rng(seed)
@@ -775,7 +784,7 @@ def test_deviations_cover_the_truth_with_constants(pole):
     """95 % of the poles and responses within 1.96 standard deviations."""
     inside = []
     truth = SYSTEM.frequency_response([0.05, 0.5, 2.0])
-    for seed in range(100):
+    for seed in range(50):
         rng = np.random.default_rng(seed)
         X, y = table(rng, levels=(3.0, -2.0), n=500, noise=0.5, pole=pole)
         model = SubspaceLTI(3, horizon=6, offset="constant", **options()).fit(X, y)
@@ -789,6 +798,7 @@ def test_deviations_cover_the_truth_with_constants(pole):
 # -- streams ---------------------------------------------------------------------------
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("offset", ["auto", "constant", "linear"])
 def test_long_tables_and_streams_have_constants(system, short_stream, offset):
     u, y = record(system, 9000)
@@ -851,6 +861,7 @@ def test_rough_models_do_not_hide_constants(choice):
         assert error_of(model) < 0.1
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [0, 2, 3, 4])
 def test_too_few_states_do_not_follow_the_level(seed):
     """Of a record far from zero, a state that stands for it is not there to move."""
@@ -874,7 +885,7 @@ def test_too_few_states_do_not_follow_the_level(seed):
 def test_a_step_from_rest_tells_that_there_is_no_constant():
     """The input is far from zero nearly all the time, and began at it."""
     u = (np.arange(500) >= 20).astype(float)[:, None]
-    for rng in map(np.random.default_rng, range(12)):
+    for rng in map(np.random.default_rng, range(4)):
         y = lfilter([0.0, 0.01], [1.0, -0.99], u, axis=0)
         y += 0.003 * rng.standard_normal(y.shape)
         model = SubspaceLTI().fit(u, y)
@@ -894,6 +905,7 @@ def test_a_constant_and_an_integrator_do_not_stand_for_a_drift():
         assert np.abs(model.predict(u + 0.5)).max() < 20.0 * np.abs(y).max()
 
 
+@pytest.mark.slow
 def test_a_given_order_has_no_state_that_stands_for_the_constants():
     """Its initial values may be those of a state that does not decay."""
     for rng in map(np.random.default_rng, range(6)):
@@ -960,7 +972,7 @@ def test_a_slow_mode_less_leaves_what_is_seen_of_the_others(rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_a_mode_slower_than_the_record_is_told_from_a_constant(size):
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         A, B = modes(0.7, 1.0 - 1e-4), np.array([[0.7], [0.014]])
         u = rng.standard_normal((3000, 1))

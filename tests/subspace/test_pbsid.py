@@ -196,6 +196,7 @@ def test_constants_are_taken_where_they_are(order):
     same.predict(two_loops(LEVELS)[0])  # which does not warn
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("level", [1.0, 1e2, 1e6])
 def test_constants_are_found_near_and_far(level):
     """A slow mode stands for near ones, and far ones hide everything else."""
@@ -206,6 +207,7 @@ def test_constants_are_found_near_and_far(level):
         assert miss(model) < 0.15
 
 
+@pytest.mark.slow
 def test_auto_finds_the_loop_about_its_point_of_work():
     X, y = two_loops(LEVELS)
     model = SubspaceLTI(2, experiment="experiment")
@@ -290,7 +292,7 @@ def test_auto_takes_it_where_there_is_feedback():
 @pytest.mark.slow
 def test_a_controller_that_answers_at_once_is_no_feedthrough():
     """A free D would be minus one over the gain of the controller."""
-    for rng in map(np.random.default_rng, range(3)):
+    for rng in map(np.random.default_rng, range(2)):
         x, n = 0.0, 1000
         r, e = np.repeat(rng.choice([-0.5, 0.5], n // 20), 20), rng.standard_normal(n)
         u, y = np.zeros((2, n, 1))
@@ -316,15 +318,15 @@ def test_a_controller_that_answers_at_once_is_no_feedthrough():
 
 def test_noise_of_a_measured_input_answers_as_a_controller_does():
     """Covariances and more are alike: what is simulated decides, and that is told."""
-    for rng in map(np.random.default_rng, range(3)):
-        u = rng.choice([-1.0, 1.0], (2000, 1))
-        y = lfilter([1.0, -0.6], [1.0, -0.8], u, axis=0)
-        y += 0.01 * rng.standard_normal(y.shape)
-        told = "answers outputs within the sample.*Else it is measured with noise"
-        with pytest.warns(UserWarning, match=told):
-            model = SubspaceLTI().fit(u + 0.1 * rng.standard_normal(u.shape), y)
-        assert_allclose(model.lti_.D, 1.0, rtol=0.05)
-        assert_allclose(model.lti_.dc_gain(), 2.0, rtol=0.05)
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (2000, 1))
+    y = lfilter([1.0, -0.6], [1.0, -0.8], u, axis=0)
+    y += 0.01 * rng.standard_normal(y.shape)
+    told = "answers outputs within the sample.*Else it is measured with noise"
+    with pytest.warns(UserWarning, match=told):
+        model = SubspaceLTI().fit(u + 0.1 * rng.standard_normal(u.shape), y)
+    assert_allclose(model.lti_.D, 1.0, rtol=0.05)
+    assert_allclose(model.lti_.dc_gain(), 2.0, rtol=0.05)
 
 
 def sampled_early(seed, n_samples=400):
@@ -339,7 +341,7 @@ def sampled_early(seed, n_samples=400):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The outputs seem to know")
 def test_auto_gives_up_what_parts_held_out_refute():
-    for seed in range(3):
+    for seed in range(2):
         (u, y), (u_other, y_other) = sampled_early(seed), sampled_early(seed + 9)
         with pytest.warns(UserWarning, match="D = 0 is (poor|unstable) .* Taken was"):
             model = SubspaceLTI().fit(u, y)
@@ -386,6 +388,7 @@ def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop()
         assert error < of_that
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("lead", [3, 6])
 def test_outputs_that_lead_the_inputs_are_told(lead):
     rng = np.random.default_rng(lead)
@@ -403,7 +406,7 @@ def test_outputs_that_lead_the_inputs_are_told(lead):
 
 @pytest.mark.slow
 def test_the_inputs_of_a_loop_with_a_reference_do_not_come_too_late():
-    for seed in range(3):
+    for seed in range(2):
         u, y = closed_loop(np.random.default_rng(seed), 2000)
         with pytest.warns(UserWarning) as told:
             SubspaceLTI().fit(u, y)
@@ -444,7 +447,8 @@ def slow_plant_in_a_loop(seed, n_samples=1000):
     return u[:, None], y[:, None], omega, response
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_order_in_a_loop_is_one_that_simulates(seed):
     u, y, omega, truth = slow_plant_in_a_loop(seed)
 
@@ -473,7 +477,8 @@ def test_auto_keeps_a_plant_that_only_the_loop_holds():
         assert_allclose(np.abs(model.lti_.poles()).max(), 1.1, atol=0.03)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1])
 def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
     """Steps of a reference through a PD controller of a magnet that falls by itself."""
     rng = np.random.default_rng(seed)
@@ -496,10 +501,9 @@ def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it(seed):
+def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it():
     """Its inputs are nearly all reference and answers to that."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     plant = StateSpace([[0.0, 1.0], [0.6, -1.7]], [[0.0], [1.0]], [[1.0, 0.0]])
     A, B = (getattr(plant.to_discrete(0.25), M) for M in "AB")
     r = rng.standard_normal(1200)
@@ -565,7 +569,8 @@ def shaken(seed, shared, n_samples=3000, size=1.0):
     return (u, y + 0.01 * y.std() * rng.standard_normal(y.shape)), plant
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1])
 def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
     samples, plant = shaken(seed, shared=True)
     model, without = SubspaceLTI().fit(*samples), SubspaceLTI(method="po-moesp")
@@ -579,7 +584,8 @@ def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
     assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_mode_that_the_subspace_hardly_shows_is_found_by_refinement(seed):
     rng = np.random.default_rng(seed)
     mode = [[0.0, 1.0], [-0.49, -0.35]]
@@ -602,7 +608,8 @@ def test_little_noise_that_moves_the_plant_is_known_for_it():
     assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1])
 def test_noise_of_a_sensor_leaves_the_plant_alone(seed):
     samples, _ = shaken(seed, shared=False)
     with warnings.catch_warnings():
@@ -662,6 +669,7 @@ def early_outputs(seed, n_samples=300):
 
 
 @pytest.mark.filterwarnings("ignore:The identified model is unstable")
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_split_must_be_as_likely_as_the_whole(seed):
     """Wald's statistic calls modes noise whose loss spoils a model that is wrong."""
@@ -693,6 +701,7 @@ def test_a_reference_of_few_sines_is_told():
         assert SubspaceLTI().fit(u, y).method_ == "pbsid"
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [1, 7])
 def test_a_controller_is_not_taken_for_the_feedthrough_of_its_plant(seed):
     """A ball on a beam: with D free, the inputs tell the noise that they answer."""
@@ -744,7 +753,8 @@ def car_with_biases(seed, speed=32.0, n_samples=4000, step=0.01):
     return u + 0.01, y + [0.004, 0.15]
 
 
-@pytest.mark.parametrize("speed, seed", [(20.0, 1), (20.0, 5), (26.0, 6)])
+@pytest.mark.broad
+@pytest.mark.parametrize("speed, seed", [(20.0, 1), (26.0, 6)])
 def test_constants_beside_a_given_order_are_no_less_likely_than_none(speed, seed):
     """The model with constants begins at the one without: levels were lost else."""
     u, y = car_with_biases(seed, speed)
@@ -755,7 +765,9 @@ def test_constants_beside_a_given_order_are_no_less_likely_than_none(speed, seed
     assert model.score(u, y) > 0.99
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1])
 def test_filters_that_know_later_samples_make_no_plant_that_alternates(seed):
     """Zero-phase decimation: inputs know the errors, and nobody controls."""
     rng = np.random.default_rng(seed)

@@ -11,6 +11,7 @@ from lpvlearn import StateSpace, SubspaceLTI
 from .conftest import LOOP_PLANT, closed_loop, miss, pbsid
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("order", [2, "auto"])
 def test_modes_of_the_noise_are_told_from_the_plant(order):
     u, y = closed_loop(np.random.default_rng(1), 2000, pole=0.9)
@@ -76,7 +77,7 @@ def test_standard_deviations_cover(pole):
     truth = C @ np.linalg.solve(z * np.eye(2) - A, np.broadcast_to(B, (3, 2, 1)))
     top = np.linalg.eigvals(A)[0]
     inside = []
-    for seed in range(40):
+    for seed in range(20):
         u, y = closed_loop(np.random.default_rng(seed), 1500, pole=pole)
         model = pbsid(2, feedthrough=False).fit(u, y)
         k = np.argmax(model.lti_.poles().imag)
@@ -92,5 +93,5 @@ def test_standard_deviations_cover(pole):
             inside += [abs(error.real) < 1.96 * std.real]
             inside += [abs(error.imag) < 1.96 * std.imag]
     # Errors of one record depend on each other: as many as its parameters count.
-    low, high = binom.interval(0.99, 40 * 4, 0.95)
-    assert low <= np.mean(inside) * 160 <= high + 1
+    low, high = binom.interval(0.99, 20 * 4, 0.95)
+    assert low <= np.mean(inside) * 80 <= high + 1

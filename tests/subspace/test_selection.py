@@ -89,6 +89,7 @@ def test_noise_that_a_rich_pilot_followed_is_found_by_the_order_itself():
     assert set(orders) <= {2, 3} and orders.count(3) > orders.count(2)
 
 
+@pytest.mark.slow
 def test_parts_held_out_decide_where_the_criterion_hardly_does():
     n_close = 0
     for seed in range(24):
@@ -179,7 +180,7 @@ def test_losses_do_not_rise_with_the_order():
 def test_parts_where_nothing_happens_do_not_overrule_the_step_before_them():
     """Noise is all that is left of a lag there: an order too low does as well."""
     rng = np.random.default_rng(0)
-    for _ in range(5):
+    for _ in range(2):
         u = (np.arange(66) >= 5).astype(float)[:, None]
         y = lfilter([0.0, 0.0, 0.4], [1.0, -0.6], u, axis=0)
         y += 0.01 * rng.standard_normal(y.shape)
@@ -211,6 +212,7 @@ def test_the_noise_of_the_choice_goes_with_it():
     assert other.candidate is None and other.order == chosen.order
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("method", ["po-moesp", "pbsid"])
 @pytest.mark.parametrize(
     ("among", "chosen"),
@@ -286,6 +288,7 @@ def test_many_short_experiments_tell_the_order():
     assert np.linalg.norm(error) < 0.03 * np.linalg.norm(exact)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("seed", [0, 2])
 def test_outputs_behind_a_filter_have_their_order(seed):
     """What such an output makes of its own past is likelier than any few states."""

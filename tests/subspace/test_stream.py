@@ -54,6 +54,7 @@ def assert_same_model(stream, whole):
     assert stream.stability_loss_ == whole.stability_loss_
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize(
     "options",
     [
@@ -312,6 +313,7 @@ def test_gaps_at_the_borders_of_batches_split_the_stream(system):
     assert stream.initial_states_.shape == (5, 5)
 
 
+@pytest.mark.broad
 @pytest.mark.parametrize("refine", [True, False])
 @pytest.mark.parametrize("gap", [997, 998, 999])
 def test_gap_at_the_end_of_the_buffer_keeps_experiments_apart(
@@ -474,6 +476,7 @@ def test_stream_warns_once_where_its_linearisation_fails(system, short_buffer, s
     assert len(found) == (true > 0.5) == (size < 1.0)
 
 
+@pytest.mark.broad
 @pytest.mark.filterwarnings("ignore:The simulation error depends on past")
 @pytest.mark.parametrize("n_first", [600, 3000])
 @pytest.mark.parametrize(
@@ -638,6 +641,7 @@ def test_single_rows_are_the_stream_of_their_table(system, short_stream):
     assert_same_model(model, SubspaceLTI(5, horizon=8).fit(u, y))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_single_rows_of_tables_wait_where_their_labels_tell_nothing(system):
     u, y = record(system, 300)

@@ -314,6 +314,7 @@ def test_chance_within_the_sample_is_no_answer_to_outputs(seed):
     assert not find_feedback(records).found
 
 
+@pytest.mark.slow
 def test_means_over_samples_know_the_next_inputs():
     """As of pandas' resample().mean(), of inputs that move meanwhile; not in a loop."""
     rng = np.random.default_rng(0)
