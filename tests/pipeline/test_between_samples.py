@@ -98,6 +98,7 @@ def test_held_inputs_stay_held():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.broad
 @pytest.mark.parametrize("lag", [3.0, 30.0])
 def test_what_a_structure_lacks_is_no_ramp(lag):
     """A lag before the spring, of which the structure knows nothing."""
