@@ -339,12 +339,13 @@ pd.DataFrame(
 # A structure in continuous time has to know what its inputs do between samples. Those
 # that a controller puts out stay (hold of order zero). Those that a sensor reads, a
 # force or a flow, go on: as held ones they come half a sample late, and parameters pay
-# for that. A pipeline tells the two apart by the distance of the structure from the
-# local models in units of their uncertainty (``discretization="auto"``), and where
-# straight lines between samples leave a quarter of the chi-square or less it takes a
-# hold of order one, as the LPV model does then: ``lpv_.hold``. Inputs that bend much
-# within a sample (less than some ten samples in a period) ask for a faster one. Single
-# models are converted by ``lti.to_continuous("foh")`` and ``to_discrete(dt, "foh")``.
+# for that. Of smooth inputs a pipeline tells it by the distance of the structure from
+# the local models in units of their uncertainty (``discretization="auto"``): where
+# straight lines between samples leave far less, it takes a hold of order one, for all
+# inputs alike, as the LPV model does then (``lpv_.hold``). Inputs that bend much within
+# a sample (less than some ten samples in a period) ask for a faster one, and held ones
+# beside smooth ones for ``"zoh"`` or ``"foh"``, by which matter more. Single models are
+# converted by ``lti.to_continuous("foh")`` and ``to_discrete(dt, "foh")``.
 #
 # Integrators and undamped oscillators
 # ------------------------------------

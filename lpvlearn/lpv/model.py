@@ -261,6 +261,7 @@ class LPVStateSpace(VersionedPickle):
             f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling}"
             f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''}"
             f"{', with offsets' if self.offsets is not None else ''}"
+            f"{', hold=' + repr(self.hold) if self.hold != 'zoh' else ''}"
             f"{', with rate terms' if self.rate_terms is not None else ''})"
         )
 
@@ -631,7 +632,8 @@ class LPVStateSpace(VersionedPickle):
         """Simulate along a measured scheduling trajectory.
 
         Input (with ``hold="zoh"``) and scheduling are held over each sampling period,
-        so that a constant scheduling gives exactly the sampled LTI model.
+        so that a constant scheduling gives exactly the sampled LTI model. With
+        ``hold="foh"`` a run begins with its first inputs, not on the way to them.
 
         Parameters
         ----------

@@ -303,9 +303,11 @@ def refine(
         first, before, weight = n_round == 0, deviation, 1.0 / deviation
         c = minimise(c, weight, n_round, rough=first)
         errors = all_errors(model_of(c), weight)
-        if known or left < 1:
+        if known:
             break
         deviation = _remaining(errors, total)
+        if left < 1:
+            break
         if not first and np.abs(deviation / before - 1.0).max() <= _SETTLED:
             break
     return Refined(

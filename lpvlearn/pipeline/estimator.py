@@ -194,10 +194,13 @@ list, default=None
         one by one and their balanced models averaged (the paper's Monte Carlo).
     discretization : {"auto", "zoh", "foh", "tustin"}, default="auto"
         From discrete to continuous time; "zoh" is exact for inputs that are held
-        between samples, "foh" for those that go on linearly to the next one, as smooth
-        inputs that were measured nearly do. "auto" is "zoh", or "foh" where the noise
-        does not explain how far a structure is from the local models, and that takes
-        three quarters and more of the chi-square; `lpv_.hold` tells.
+        between samples, "foh" for those that all go on linearly to the next one, as
+        smooth inputs that were measured nearly do (`local` needs its feedthrough then).
+        "auto" is "zoh", or "foh" where there is a structure, inputs are smooth, the
+        noise does not explain how far it is from most of the local models, and explains
+        what "foh" leaves, a quarter or less (or "foh" leaves a twenty-fifth);
+        `lpv_.hold` tells. Models of single points are in continuous time: sample them
+        likewise, by ``to_discrete(dt, "foh")``.
     offsets : {"auto", None}, default="auto"
         Experiments stand about points of work, inputs u0 and outputs y0: where the
         local models have constants (`SubspaceLTI.offset_`, `detrend`), the LPV model
@@ -559,8 +562,10 @@ list, default=None
             if restructurer is None:
                 ways = without_structure(*known, form, every=bool(moving))
             else:
-                by_data = self.discretization == "auto"
-                restructure = restructured_by_hold if by_data else restructure_points
+                restructure = restructure_points
+                if self._hold_is_chosen_last:
+                    certain = self.discretization == "foh"
+                    restructure = partial(restructured_by_hold, certain=certain)
                 found = with_foreseen(restructure(restructurer, *known, limit))
                 ways = mirror_images(found) if moving else [found]
             # experiments that move tell what no point does
@@ -589,7 +594,7 @@ list, default=None
                 input_names=experiments[0].input_names,
                 output_names=self.output_names_,
                 units=self.units,
-                hold="foh" if found.local[0].discretization == "foh" else "zoh",
+                hold=found.local[0].hold,
             )
             self.lpv_ = replace(
                 self.lpv_, offsets=self._fit_offsets(models, not moving)
@@ -791,6 +796,15 @@ list, default=None
             return self.interpolator is None or isinstance(self.interpolator, AutoLPV)
         return not isinstance(self.restructurer, str)
 
+    @property
+    def _hold_is_chosen_last(self) -> bool:
+        """Whether inputs count as held until there are parameters of a structure."""
+        structured = not (
+            self.restructurer is None or isinstance(self.restructurer, str)
+        )
+        ramps = self.discretization == "foh" and structured
+        return self.discretization == "auto" or ramps
+
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
             return PolynomialLPV(degree=0)
@@ -809,13 +823,14 @@ list, default=None
         What was `told` of models is taken back where others are taken for them.
         """
         efficient = getattr(self.restructurer, "norm", None) == "covariance"
-        by_data = self.discretization == "auto"
         identify = partial(
             identify_points,
             structure=structure,
             sampling_time=self.sampling_time_,
             combine=self.combine,
-            discretization="zoh" if by_data else self.discretization,
+            discretization=(
+                "zoh" if self._hold_is_chosen_last else self.discretization
+            ),
             efficient=self.efficient or efficient,
             deviate=self._needs_deviations(),
         )

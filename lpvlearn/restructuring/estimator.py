@@ -690,7 +690,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self._describe(problem, result, floor)
             settled = False
             if self.norm == "covariance":
-                others = [fit.x for fit in promising(fits)]
+                others = [*(fit.x for fit in promising(fits)), *given]
                 settled = self._weigh(problem, estimates, others)
             at = ParameterUncertainty(problem, self.params_)
             self.identifiability_ = at.identifiability()

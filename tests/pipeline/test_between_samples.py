@@ -1,5 +1,7 @@
 """Inputs that are held between samples, and inputs that are smooth."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,13 @@ from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
+    StateSpace,
+    SubspaceLTI,
     from_trajectories,
     load,
     save,
 )
+from lpvlearn.pipeline.one_basis.between_samples import _meets_more
 
 DT = 0.05
 
@@ -88,6 +93,50 @@ def test_several_realizations_tell_it_too(combine):
     assert model.lpv_.hold == "foh" and off(model) < 0.015
     given = pipeline(combine=combine, discretization="foh").fit(X, y)
     np.testing.assert_allclose(given.parameters_, model.parameters_, rtol=1e-5)
+
+
+def test_ramps_without_noise_are_found():
+    X, y = table("foh", noise=0.0)
+    model = pipeline().fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The response is hardly known")
+@pytest.mark.parametrize("discretization", ["auto", "foh"])
+def test_states_that_noise_has_do_not_lead_astray_beyond_the_nyquist_frequency(
+    discretization,
+):
+    X, y = table("foh")
+    local = SubspaceLTI(order=4)
+    model = pipeline(local=local, discretization=discretization).fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 0.02
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_lead_is_no_ramp_where_inputs_are_seen_to_stay():
+    """Outputs that are read half a sample after the inputs look like that."""
+    rng, found = np.random.default_rng(0), []
+    for kappa, row in zip((0.0, 0.5, 1.0), TRUE, strict=True):
+        u = rng.choice([-1.0, 1.0], 100).repeat(3)[:, None]
+        A, B = (SPRING.matrices(row)[k] for k in (0, 1))
+        y = StateSpace(A, B, [[1.0, DT / 2]]).simulate(u, sampling_time=DT)
+        found.append((u, kappa, y + 0.02 * y.std() * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(found, sampling_time=DT)
+    model = pipeline().fit(X, y)
+    assert model.lpv_.hold == "zoh"
+    assert (model.report_["chi2"] > 30).all()
+
+
+def test_most_points_decide():
+    """One whose structure lacks something does not speak for the others."""
+    fits = [SimpleNamespace(chi2_=c, degrees_of_freedom_=2) for c in (1, 2, 1, 5e4)]
+    other = [SimpleNamespace(chi2_=900.0, degrees_of_freedom_=2)] * 4
+    held, ramps = (SimpleNamespace(restructurers=own) for own in (fits, other))
+    assert not _meets_more(ramps, held)
+    better = SimpleNamespace(restructurers=[*fits[:3], other[0]])
+    worse = SimpleNamespace(restructurers=[*other[:3], fits[3]])
+    assert _meets_more(better, worse) and not _meets_more(worse, better)
 
 
 def test_held_inputs_stay_held():

@@ -22,6 +22,7 @@ from lpvlearn import (
 )
 from lpvlearn.exceptions import ExtrapolationWarning, collected
 from lpvlearn.inspection import SimulationDisplay
+from lpvlearn.lpv.sensitivity import coefficients_of, with_coefficients
 
 from ..conftest import (
     ROLES,
@@ -411,8 +412,9 @@ def test_a_gain_without_states_has_no_rate_terms(rate):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.02])
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
-def test_smooth_inputs_of_moving_records_are_held_or_ramps(hold):
+def test_smooth_inputs_of_moving_records_are_held_or_ramps(hold, noise):
     rng = np.random.default_rng(0)
     t, kappa = np.arange(600), 1 - np.cos(np.linspace(0, 9, 600))
     f = np.linspace(0.01, 1 / 10, 15)
@@ -424,11 +426,20 @@ def test_smooth_inputs_of_moving_records_are_held_or_ramps(hold):
     )
     truth = LPVStateSpace(structure, form, ends, hold=hold)
     y = truth.simulate(u, kappa, 0.05)
-    y += 0.02 * y.std() * rng.standard_normal(y.shape)
+    y += noise * y.std() * rng.standard_normal(y.shape)
     X, y = from_trajectories([(u, kappa, y)], sampling_time=0.05)
     roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
     form = PolynomialLPV(1)
     model = OutputErrorLPV(structure, rate=False, interpolator=form, **roles)
     assert model.fit(X, y).lpv_.hold == hold
     found, true = (m.parameters([0.0, 1.0, 2.0]) for m in (model.lpv_, truth))
-    np.testing.assert_allclose(found, true, rtol=0.03)
+    np.testing.assert_allclose(found, true, rtol=0.03 if noise else 1e-6)
+
+
+def test_errors_are_those_that_are_left_however_few_the_steps():
+    X, y = sweeps(noise=0.0, n=1)
+    truth = spring_lpv()
+    start = with_coefficients(truth, 1.05 * coefficients_of(truth))
+    few = OutputErrorLPV(start, max_iter=4, rate=False, **ROLES).fit(X, y)
+    assert (np.asarray(y) - few.predict(X)).std() < 1e-6
+    assert few.deviation_[0] < 1e-6

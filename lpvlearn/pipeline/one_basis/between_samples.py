@@ -10,23 +10,45 @@ one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, retold
-from ...restructuring.minimise_covariance import efficient_parameters, is_explained
+from ...restructuring.minimise_covariance import is_explained
+from ...restructuring.problem import GOOD_FIT
 from ..points.local_models import LocalModel, as_ramps
 from ..running.runner import PointRunner
 from .structured_models import StructuredModels, restructure_points
 
-# Factor by which the squared distance from the black boxes, in units of their
-# uncertainty, must be less where inputs go on: half a sample of delay makes it that
-# great wherever it matters.
-_LESS = 4.0
+Array = NDArray[np.float64]
+
+# Of smooth inputs: samples that differ from the one before, and how far these are from
+# one another, relative to how far inputs move.
+_MOVING, _SMOOTH = 0.6, 0.75
+
+# Factors by which the squared distance from a black box must be less with ramps: where
+# noise explains what is left, and where it does not. A lead of half a sample looks like
+# ramps, but for the highest frequencies.
+_LESS, _FAR_LESS = 4.0, 25.0
+
+# Part of `max_time` that a second search has at least
+_LEAST_SHARE = 0.2
+
+
+def are_smooth(inputs: Sequence[Array]) -> bool:
+    """Whether an input may go on between samples, (n_samples, n_inputs) of each record.
+
+    Inputs that are seen to stay, or jump as far as they move at all, are held.
+    """
+    changes = np.vstack([np.diff(u, axis=0) for u in inputs])
+    about = np.vstack([u - u.mean(axis=0) for u in inputs])
+    smooth = np.linalg.norm(changes, axis=0) < _SMOOTH * np.linalg.norm(about, axis=0)
+    return bool((((changes != 0).mean(axis=0) > _MOVING) & smooth).any())
 
 
 def restructured_by_hold(
@@ -36,48 +58,70 @@ def restructured_by_hold(
     runner: PointRunner,
     sampling_time: float,
     max_time: float | None = None,
+    *,
+    certain: bool = False,
 ) -> StructuredModels:
     """As `restructure_points`, with held inputs, or ramps where these explain far more.
 
-    `local` are models with held inputs. What was told of the structure is dropped where
-    ramps take their place.
+    At most points, and where inputs are smooth; or where it is `certain`. `local` are
+    models with held inputs: from parameters that fit these, the search goes on with
+    ramps, whose responses beyond the Nyquist frequency nothing bounds. What was told of
+    the structure is dropped where ramps take their place.
     """
     began = perf_counter()
-    options = runner, sampling_time
     with retold() as told:
-        found = restructure_points(restructurer, local, points, *options, max_time)
-        smooth = _with_ramps(found)
+        found = restructure_points(
+            restructurer, local, points, runner, sampling_time, max_time
+        )
+        # what ramps do until the next sample is in part done at once
+        direct = any(m.lti.D.any() or m.integrating for m in found.local)
+        smooth = are_smooth([e.inputs for group in points.experiments for e in group])
+        met = all(map(_is_met, found.restructurers))
+        if not certain and (met or not (direct and smooth)):
+            return found
         if max_time is not None:
-            max_time -= perf_counter() - began
-        if smooth is not None and not (max_time is not None and max_time <= 0.0):
-            told.clear()
-            found = restructure_points(
-                restructurer, smooth, found.points, *options, max_time
+            left = max_time - (perf_counter() - began)
+            max_time = max(left, _LEAST_SHARE * max_time)
+        pairs = zip(found.local, found.points.experiments, strict=True)
+        no_logarithm = nullcontext() if certain else suppress(ValueError)
+        with collected() as later, no_logarithm:
+            other = restructure_points(
+                restructurer,
+                [as_ramps(*known, sampling_time) for known in pairs],
+                found.points,
+                runner,
+                sampling_time,
+                max_time,
+                starts=found.theta,
             )
+            if certain or _meets_more(other, found):
+                told[:], found = later, other
     return found
 
 
-def _with_ramps(found: StructuredModels) -> list[LocalModel] | None:
-    """The local models with ramps between samples, where these explain far more."""
-    fits = found.restructurers
-    cost = sum(getattr(fitted, "chi2_", np.nan) for fitted in fits)
-    freedom = sum(getattr(fitted, "degrees_of_freedom_", np.nan) for fitted in fits)
-    if not freedom > 0 or is_explained(cost, freedom):
-        return None
-    groups = found.points.experiments
-    with collected(), suppress(ValueError):  # a pole may have no logarithm
-        smooth = list(map(as_ramps, found.local, groups))
-        if _cost(found, smooth) < cost / _LESS:
-            return smooth
-    return None
+def _is_met(fitted: Any) -> bool:
+    """Whether a structure meets the black box of a point, as far as noise lets tell."""
+    cost, freedom = _cost(fitted)
+    return is_explained(cost, freedom) if freedom else cost <= GOOD_FIT**2
 
 
-def _cost(found: StructuredModels, smooth: Sequence[LocalModel]) -> float:
-    """Squared distance of the structure from other black boxes, near its parameters."""
-    total = 0.0
-    for model, theta in zip(smooth, found.theta, strict=True):
-        fit = efficient_parameters(
-            found.structure, model.estimates, theta, admissible=lambda _: True
-        )
-        total += np.inf if fit is None else fit.cost
-    return total
+def _cost(fitted: Any) -> tuple[float, float]:
+    """Squared distance from a black box, and its degrees of freedom.
+
+    Where no uncertainty is known, relative and 0.
+    """
+    cost = getattr(fitted, "chi2_", np.nan)
+    if np.isfinite(cost):
+        return cost, fitted.degrees_of_freedom_
+    return getattr(fitted, "fit_error_", 0.0) ** 2, 0.0
+
+
+def _meets_more(other: StructuredModels, found: StructuredModels) -> bool:
+    """Whether at most points another hold leaves far less."""
+    if len(other.restructurers) < len(found.restructurers):
+        return False
+    votes = []
+    for one, held in zip(other.restructurers, found.restructurers, strict=True):
+        less = _LESS if _is_met(one) else _FAR_LESS
+        votes.append(not _is_met(held) and less * _cost(one)[0] < _cost(held)[0])
+    return bool(np.mean(votes) > 0.5)

@@ -96,12 +96,14 @@ def restructure_points(
     runner: PointRunner,
     sampling_time: float,
     max_time: float | None = None,
+    starts: Array | None = None,
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
     "aligned" or "passthrough": the entries of the balanced models are parameters.
     `max_time` bounds the seconds of all points: equal shares, known in advance, and
-    what is left of it for the help of neighbours.
+    what is left of it for the help of neighbours. Where `starts` of all points are
+    given, (n_points, n_params), no others are looked for.
     """
     began = perf_counter()
     if isinstance(restructurer, str):
@@ -120,26 +122,28 @@ def restructure_points(
         (model.lti, model.realizations, model.estimates if weighed else [])
         for model in local
     ]
+    given = [None] * len(tasks) if starts is None else list(starts)
     found = runner.run(
         "restructuring",
         _restructure_point,
-        tasks,
+        [(*task, start) for task, start in zip(tasks, given, strict=True)],
         points.kappa,
         restructurer=restructurer,
     )
     kept = [k for k, done in enumerate(found) if done is not None]
     first = [done.result for done in found if done is not None]
-    with bounded(None if max_time is None else began + max_time - perf_counter()):
-        better = runner.call(
-            _help_neighbours,
-            first,
-            [tasks[k] for k in kept],
-            points.kappa[kept],
-            restructurer,
-            ignore=["fitted"],
-        )
-    for k, other in zip(kept, better, strict=True):
-        found[k] = other or found[k]
+    if starts is None:
+        with bounded(None if max_time is None else began + max_time - perf_counter()):
+            better = runner.call(
+                _help_neighbours,
+                first,
+                [tasks[k] for k in kept],
+                points.kappa[kept],
+                restructurer,
+                ignore=["fitted"],
+            )
+        for k, other in zip(kept, better, strict=True):
+            found[k] = other or found[k]
     tell_skipped(found, points.kappa)
     helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
@@ -512,12 +516,15 @@ def _restructure_point(
     model: StateSpace,
     realizations: Sequence[StateSpace],
     estimates: Sequence[Estimate],
+    start: Array | None = None,
     *,
     restructurer: Any,
     **options: Any,
 ) -> Any:
-    """A clone of the restructurer, fitted to one local model."""
+    """A clone of the restructurer, fitted to one local model; from a start alone."""
     restructurer = clone(restructurer)
+    if start is not None:
+        options |= {"starts": [start], "search": False}
     if len(realizations) > 1:
         options["realizations"] = realizations
     if estimates:

@@ -90,6 +90,11 @@ class LocalModel:
     estimates: list[Estimate] = field(default_factory=list)
 
     @property
+    def hold(self) -> str:
+        """What inputs do between samples, as `LPVStateSpace` has it."""
+        return "foh" if self.discretization == "foh" else "zoh"
+
+    @property
     def order_of_rates(self) -> int:
         """As the estimator counts, without integrators."""
         return self.order - len(self.integrating)
@@ -238,16 +243,21 @@ def _averaged(
     )
 
 
-def as_ramps(model: LocalModel, experiments: Sequence[Experiment]) -> LocalModel:
+def as_ramps(
+    model: LocalModel, experiments: Sequence[Experiment], sampling_time: float
+) -> LocalModel:
     """The model whose inputs are ramps between samples, of one for held inputs.
 
-    It has `estimates`. Raises a ValueError where it has no equivalent.
+    Raises a ValueError where it has no equivalent.
     """
     estimates: list[Estimate] = [
         (estimate.to_continuous("foh"), _all_continuous(list(pairs), "foh"))
         for estimate, pairs in model.estimates
     ]
     models = [estimate for estimate, _ in estimates]
+    if not models:  # the uncertainty is not known
+        held = model.realizations or [model.lti]
+        models = [m.to_discrete(sampling_time).to_continuous("foh") for m in held]
     if len(models) > 1:
         models = _in_one_basis(models, experiments)
         lti = _average(models)

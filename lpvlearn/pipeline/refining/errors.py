@@ -22,6 +22,7 @@ from ...lpv.refinement import Own, Record, refine, simulated, squares, weights_o
 from ...lpv.weighting import is_chance
 from ..checks.bands import output_errors
 from ..checks.error_warnings import tell_of_noisy_scheduling
+from ..one_basis.between_samples import are_smooth
 from ..one_basis.structured_models import StructuredModels
 
 Array = NDArray[np.float64]
@@ -36,10 +37,9 @@ _MISSED, _MORE = 0.2, 3.0
 # and of its squares what is rounding
 _NEARER, _ROUNDING = 0.5, 1e-12
 
-# Of smooth inputs: samples that differ from the one before, and how far these are from
-# one another, relative to how far inputs move. Of a hold that is taken for another one:
-# steps after which the two are compared, and what it gains in the log-likelihood
-_MOVING, _SMOOTH, _STEPS, _LIKELIER = 0.6, 0.75, 15, 10.0
+# Of a hold that is taken for another one: steps after which the two are compared, and
+# what it gains in the log-likelihood
+_STEPS, _LIKELIER = 15, 10.0
 
 
 def record_of(e: Experiment, sampling_time: float) -> Record:
@@ -150,13 +150,9 @@ def _missed(
 def follow_ramps(model: LPVStateSpace, records: Sequence[Record], own: Own) -> bool:
     """Whether a refined model meets records far better with ramps between samples.
 
-    By the likelihood, after some steps with each hold. Inputs that are seen to stay, or
-    jump as far as they move at all, are held.
+    By the likelihood, after some steps with each hold.
     """
-    changes = np.vstack([np.diff(record.u, axis=0) for record in records])
-    about = np.vstack([record.u - record.u.mean(axis=0) for record in records])
-    smooth = np.linalg.norm(changes, axis=0) < _SMOOTH * np.linalg.norm(about, axis=0)
-    if not (((changes != 0).mean(axis=0) > _MOVING) & smooth).any():
+    if not are_smooth([record.u for record in records]):
         return False
     noise = []
     for hold in ("zoh", "foh"):
@@ -166,7 +162,7 @@ def follow_ramps(model: LPVStateSpace, records: Sequence[Record], own: Own) -> b
         except ValueError:  # it diverges
             return False
         noise.append(found.deviation)
-    gain = len(changes) * np.log(noise[0] / noise[1]).sum()
+    gain = sum(len(record.u) for record in records) * np.log(noise[0] / noise[1]).sum()
     return bool(gain > _LIKELIER)
 
 

@@ -287,8 +287,10 @@ def _asks_for_constants(
 def through(form: Any, found: StructuredModels, dt: float) -> LPVStateSpace:
     """The LPV model through operating points, by a clone of a form."""
     delay = common_delay(found.local, found.points.kappa, dt)
-    form = over_points(clone(form), found)
-    return LPVStateSpace(found.structure, form, found.points.span, input_delay=delay)
+    form, hold = over_points(clone(form), found), found.local[0].hold
+    return LPVStateSpace(
+        found.structure, form, found.points.span, input_delay=delay, hold=hold
+    )
 
 
 def best_along(
