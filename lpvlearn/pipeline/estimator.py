@@ -799,10 +799,8 @@ list, default=None
     @property
     def _hold_is_chosen_last(self) -> bool:
         """Whether inputs count as held until there are parameters of a structure."""
-        structured = not (
-            self.restructurer is None or isinstance(self.restructurer, str)
-        )
-        ramps = self.discretization == "foh" and structured
+        begins_anywhere = isinstance(self.restructurer, GrayBoxRestructurer)
+        ramps = self.discretization == "foh" and begins_anywhere
         return self.discretization == "auto" or ramps
 
     def _interpolator(self, n_points: int) -> Any:
