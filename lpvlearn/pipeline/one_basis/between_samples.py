@@ -73,11 +73,8 @@ def restructured_by_hold(
         found = restructure_points(
             restructurer, local, points, runner, sampling_time, max_time
         )
-        # what ramps do until the next sample is in part done at once
-        direct = any(m.lti.D.any() or m.integrating for m in found.local)
-        smooth = are_smooth([e.inputs for group in points.experiments for e in group])
         met = all(map(_is_met, found.restructurers))
-        if not certain and (met or not (direct and smooth)):
+        if not certain and (met or not _may_be_ramps(found)):
             return found
         if max_time is not None:
             left = max_time - (perf_counter() - began)
@@ -97,6 +94,13 @@ def restructured_by_hold(
             if certain or _meets_more(other, found):
                 told[:], found = later, other
     return found
+
+
+def _may_be_ramps(found: StructuredModels) -> bool:
+    """Whether inputs are smooth, and models do at once a part of what ramps do."""
+    direct = any(model.lti.D.any() or model.integrating for model in found.local)
+    groups = found.points.experiments
+    return direct and are_smooth([e.inputs for group in groups for e in group])
 
 
 def _is_met(fitted: Any) -> bool:
