@@ -118,6 +118,8 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
         return None
     rest = SplineLPV(extrapolation="ignore").fit(points.kappa, outputs / sizes[1])
     bends = [_about_mean(rest.predict(run.kappa)) for run in runs]
+    if not (_most(bends) > _SLIGHT).any():
+        return None
     travelled = _square([_about_mean(run.kappa) for run in runs])
     steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
     beyond, added = iter(bends), []
@@ -139,6 +141,12 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
     still = (np.where(moves, sizes[1] * change, 0.0) for change in changes)
     groups = [[_without(run, next(still)) for run in g] for g in points.experiments]
     return replace(points, experiments=groups)
+
+
+def _most(bends: Sequence[Array]) -> Array:
+    """What outputs may move at most within a run, with all that slopes may add."""
+    size = np.max([bend.std(axis=0) for bend in bends], axis=0)
+    return size + _ADDED * np.sqrt(_square(bends) / min(map(len, bends)))
 
 
 def _moves(changes: Sequence[Array], outputs: Sequence[Array]) -> NDArray[np.bool_]:
@@ -186,9 +194,13 @@ def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> tuple[Array, 
     H, Y = np.vstack(causes), np.vstack(effects)
     size = np.linalg.norm(H, axis=0)
     size[size == 0.0] = 1.0
-    inverse = np.linalg.pinv(H / size, rcond=_RCOND) / size[:, None]
-    found = inverse @ Y
-    noise = (Y - H @ found).T @ (Y - H @ found) / max(len(H) - H.shape[1], 1)
+    # by the triangular factor of all, which has the products of all columns
+    factor = np.asarray(np.linalg.qr(np.hstack([H / size, Y]), mode="r"))
+    R, seen = np.split(factor, [len(size)], axis=1)
+    inverse = np.linalg.pinv(R, rcond=_RCOND) / size[:, None]
+    found = inverse @ seen
+    left = seen - (R * size) @ found
+    noise = left.T @ left / max(len(H) - len(size), 1)
     # of all lags of every output, and of the scheduling variables
     sums = np.zeros((ny + n_scheduling, H.shape[1]))
     sums[:ny, : ny * lags] = np.kron(np.eye(ny), np.ones(lags))
