@@ -176,6 +176,7 @@ def uses(model, table, y):
     yield ResidualDisplay.from_estimator(model, table, y).tests["p_value"]
 
 
+@pytest.mark.slow
 def test_outputs_are_found_by_their_names():
     rng = np.random.default_rng(0)
     plant = StateSpace(0.9, 1, [[1], [3]], [[0], [1]], sampling_time=0.1)
@@ -279,6 +280,7 @@ def test_holes_are_gaps_for_a_fit_that_splits(kind, hole, at_home):
     SimulationDisplay.from_estimator(model, table, y, **estimate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MODELS)
 def test_jitter_is_accepted_up_to_the_tolerance_and_told(kind, at_home):
     X, Y = TABLES[kind]

@@ -35,6 +35,7 @@ def test_results_are_those_of_the_spring(folder):
     assert [path for path in folder.iterdir() if path.name.startswith(".")] == []
 
 
+@pytest.mark.slow
 def test_one_record_of_levels_is_cut_at_them(folder, tmp_path):
     X, y = spring_tables(n_samples=300)
     log = X.join(y).drop(columns="run").assign(time=0.02 * np.arange(len(X)))
@@ -70,6 +71,7 @@ def test_levels_of_the_column_that_tells_experiments_apart(tmp_path):
         assert_allclose(points.index, KAPPA)
 
 
+@pytest.mark.slow
 def test_a_row_of_units_tells_that_of_the_time(folder, tmp_path):
     table = pd.read_csv(folder / "runs.csv").query("kappa == 0.5")
     text = table[["time", "force", "position"]].to_csv(index=False)

@@ -46,6 +46,7 @@ def test_predict_from_the_middle_of_an_experiment(folder, model, tmp_path):
     )  # from rest it begins in mid-motion
 
 
+@pytest.mark.slow
 def test_report_tells_the_summary_and_writes_a_page(folder, model, tmp_path):
     status, out, error = run("report", model)
     assert (status, error) == (0, "")
@@ -58,7 +59,7 @@ def test_report_tells_the_summary_and_writes_a_page(folder, model, tmp_path):
     assert "Measured and simulated" in page.read_text()
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("timed", [False, True])
 def test_several_files_are_experiments_to_a_model_of_one_file(folder, tmp_path, timed):
     table = pd.read_csv(folder / "runs.csv").query("kappa == 0.5")

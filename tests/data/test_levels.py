@@ -86,6 +86,7 @@ def test_wrong_arguments_are_refused(options, message):
         split_levels(table(np.full(300, np.nan)), "kappa")
 
 
+@pytest.mark.slow
 def test_one_record_of_levels_gives_the_model_of_many():
     """A staircase through the points of the spring, in one simulation."""
     x, truth = staircase(KAPPA, n=500, ramp=50)

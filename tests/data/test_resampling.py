@@ -207,6 +207,7 @@ def test_a_jittering_loop_is_identified_after_it():
     assert errors["auto"] < 0.2 * errors["[]"]
 
 
+@pytest.mark.slow
 def test_gaps_go_on_to_a_fit_that_splits():
     X, y = spring_tables(n_samples=400)
     kept = ~X["time"].between(2.0, 2.6).to_numpy()

@@ -43,7 +43,7 @@ def told_of_motion(model, X, y, scoring):
     return scores, [str(w.message) for w in caught if MOTION in str(w.message)]
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("scoring", [None, bft_scorer])
 def test_folds_that_start_in_mid_motion_are_warned_of(spring, scoring):
     """Four of the five blocks start in the middle."""

@@ -132,6 +132,7 @@ def repeat_of(X):
 # ----------------------------------------------------------------- scikit-learn's tools
 
 
+@pytest.mark.slow
 def test_cross_validation_by_experiment_with_several_scorers(few, pipeline):
     X, y = few
     results = cross_validate(
@@ -148,6 +149,7 @@ def test_cross_validation_by_experiment_with_several_scorers(few, pipeline):
     assert (results["test_r2"] > 0.998).all()
 
 
+@pytest.mark.slow
 @EXTRAPOLATES
 @pytest.mark.filterwarnings("ignore:any 3 points lie on a form")  # three are left
 def test_every_operating_point_is_predicted_by_the_others(data, pipeline):
@@ -165,6 +167,7 @@ def test_every_operating_point_is_predicted_by_the_others(data, pipeline):
     assert (scores > 95).all()  # the true parameters are a parabola
 
 
+@pytest.mark.slow
 def test_every_experiment_is_predicted_by_the_others(few, pipeline):
     X, y = few
     scores = cross_val_score(pipeline, X, y, groups=X["run"], cv=LeaveOneGroupOut())
@@ -201,6 +204,7 @@ def test_interior_points_of_a_grid_are_those_that_others_surround(jitter):
     assert sorted(held_out) == sorted(set(grid) - set(corners))
 
 
+@pytest.mark.slow
 def test_grid_search_over_all_three_steps_refits_the_best(data, pipeline):
     X, y = data
     grid = [
@@ -263,6 +267,7 @@ def test_a_transformed_target_is_transformed_back(few):
     assert make_bft_scorer(burn_in=20)(scaled, X, y) > 96
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["pandas", "default"])
 def test_a_column_transformer_stands_in_front(few, pipeline, output):
     X, y = few
@@ -303,6 +308,7 @@ def test_splits_that_tear_experiments_raise_and_teach(data, pipeline, cv):
 # ---------------------------------------------------------------------------- memory
 
 
+@pytest.mark.slow
 def test_a_search_over_the_degree_identifies_nothing_twice(few, counted, tmp_path):
     X, y = few
     pipeline = LocalLPVPipeline(
@@ -321,6 +327,7 @@ def test_a_search_over_the_degree_identifies_nothing_twice(few, counted, tmp_pat
     pd.testing.assert_frame_equal(again.parameters_, plain.parameters_)
 
 
+@pytest.mark.slow
 @EXTRAPOLATES
 def test_folds_share_the_operating_points_they_have_in_common(data, counted, tmp_path):
     X, y = data
@@ -331,6 +338,7 @@ def test_folds_share_the_operating_points_they_have_in_common(data, counted, tmp
     assert CountingSubspace._fits == CountingRestructurer._fits == 4
 
 
+@pytest.mark.slow
 def test_another_solver_restructures_anew_but_does_not_identify(few, counted, tmp_path):
     X, y = few
     pipeline = LocalLPVPipeline(**counted, memory=tmp_path, **ROLES).fit(X, y)
@@ -441,6 +449,7 @@ def test_blocks_without_experiments_are_one_record():
         np.testing.assert_array_equal(test, own)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_later_parts_of_experiments_are_predicted_from_estimated_states(few, pipeline):
     X, y = few
@@ -459,6 +468,7 @@ def test_later_parts_of_experiments_are_predicted_from_estimated_states(few, pip
 # -------------------------------------------------------------------- choosing a degree
 
 
+@pytest.mark.slow
 def test_points_left_out_choose_the_degree_that_the_sweep_confirms(tmp_path):
     """The arm at full size: tests/benchmarks/choose_degree.py."""
     kappas = np.linspace(0, 1.5, 5)

@@ -48,6 +48,7 @@ def test_balanced_prbs_integrates_to_zero_over_each_window():
     np.testing.assert_array_equal(u.reshape(10, 40, 2).sum(axis=1), 0)
 
 
+@pytest.mark.slow
 def test_noise_has_the_asked_signal_to_noise_ratio_and_is_white():
     options = {"n_operating_points": 2, "duration": 0.5, "sweep_duration": 0.01}
     noisy, clean = (

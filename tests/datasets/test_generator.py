@@ -66,6 +66,7 @@ def test_local_validation_is_new_and_noise_free():
     np.testing.assert_allclose(data.y_local, y.reshape(-1, 2), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_local_experiments_are_local_and_linear():
     data = make_flexible_arm(n_operating_points=3, random_state=0)
     groups = data.X_local.groupby("experiment")
@@ -79,6 +80,7 @@ def test_local_experiments_are_local_and_linear():
         assert (error < 0.01 * np.linalg.norm(y - y.mean(axis=0), axis=0)).all()
 
 
+@pytest.mark.slow
 def test_sweep_visits_the_range_of_the_operating_points():
     data = make_flexible_arm(n_operating_points=1, duration=0.1, random_state=0)
     theta2 = np.arccos(data.X_sweep["kappa"])

@@ -55,6 +55,7 @@ def displays(pipeline, tables):
     ]
 
 
+@pytest.mark.slow
 def test_every_text_is_of_8_points_or_more_and_every_figure_800_pixels_wide(
     displays, plt
 ):

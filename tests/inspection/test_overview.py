@@ -13,6 +13,7 @@ def titles(figure):
     return [part._suptitle.get_text() for part in figure.subfigs]
 
 
+@pytest.mark.slow
 def test_a_page_of_a_pipeline_with_and_without_a_table(noisy, tables):
     alone = plot_overview(noisy)
     assert titles(alone)[:2] == ["Parameters", "Poles"] and len(alone.subfigs) == 4
@@ -24,6 +25,7 @@ def test_a_page_of_a_pipeline_with_and_without_a_table(noisy, tables):
     figure.draw_without_rendering()
 
 
+@pytest.mark.slow
 def test_a_page_over_two_variables_says_what_it_leaves_out(tables):
     X, y = tables
     X = X.assign(other=(X["run"] > "b") * 1.0)

@@ -90,6 +90,7 @@ def test_panels_are_the_correlations_of_the_estimators_errors(plant, fitted, err
     assert set(display.tests["input"]) == {"", "torque", "valve"}
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_states_is_seen_and_said(plant, fitted):
     with pytest.warns(UserWarning, match="order 2 lacks states"):
         poor = SubspaceLTI(order=2, horizon=8, **ROLES).fit(*plant)
@@ -149,6 +150,7 @@ def test_arrays_get_numbered_names_and_a_search_shows_its_best():
     assert found.input_names == ["u1"]
 
 
+@pytest.mark.slow
 def test_texts_can_be_read_and_a_subplot_is_divided(plant, fitted, plt):
     from matplotlib.text import Text
 

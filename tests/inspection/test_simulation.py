@@ -154,6 +154,7 @@ def test_bands_are_those_of_outputs_without_noise(noisy, tables):
     assert "simulated ± 2 std: BFT" in legend_texts(display.axes_[0])[1]
 
 
+@pytest.mark.slow
 def test_bands_that_are_not_known_are_refused(noisy, tables):
     options = {"uncertainty": True}
     with pytest.raises(ValueError, match="`uncertainty` must be False.*'estimate'"):

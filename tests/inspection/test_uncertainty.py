@@ -56,6 +56,7 @@ def test_two_variables_make_a_map():
     assert (display.ax_.get_xlabel(), display.ax_.get_ylabel()) == ("a", "b")
 
 
+@pytest.mark.slow
 def test_maps_give_a_constant_variable_a_width_and_do_not_leave_its_value(tables):
     X, y = tables
     fitted = LocalLPVPipeline(

@@ -151,6 +151,7 @@ def test_three_points_of_one_parameter_that_varies_carry_a_parabola():
     np.testing.assert_allclose(model.predict([[0.5]]), [[30, 1.2, 50]], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_forms_of_two_variables():
     axes = np.meshgrid(np.linspace(0, 1, 5), np.linspace(20, 40, 4), indexing="ij")
     kappa = np.stack(axes, axis=-1).reshape(-1, 2)
@@ -212,6 +213,7 @@ def test_polynomials_of_high_degrees_must_foresee_points(seed):
     assert np.abs(drawn).max() < np.abs(values).max() + 0.2
 
 
+@pytest.mark.slow
 def test_rational_forms_of_a_grid_must_foresee_whole_levels():
     """Three levels determine no common denominator, whatever single points tell."""
     kappa = np.array([[q, h] for q in (1.0, 4.0, 8.0) for h in (0.0, 0.5, 1.0)])
@@ -230,6 +232,7 @@ def test_rational_forms_of_a_grid_must_foresee_whole_levels():
         assert np.abs(model.predict(fine) / truth(fine) - 1.0).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_rational_form_that_is_a_cubic_without_a_point_is_not_told_by_that():
     """Through five points it has a pole, through four of them it meets the spline's."""
     kappa = np.array([0.0, 0.22, 0.44, 0.67, 1.0])[:, None]
@@ -242,7 +245,7 @@ def test_a_rational_form_that_is_a_cubic_without_a_point_is_not_told_by_that():
         assert model.form_ == "cubic"
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 22, 24, 38])
 def test_squares_of_several_variables_must_foresee_scattered_points(seed):
     """Products of squares, nine for twelve points: they swing between these."""
@@ -262,6 +265,7 @@ def test_squares_of_several_variables_must_foresee_scattered_points(seed):
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_points", [1, 3, 4, 5])
 def test_a_variable_of_one_value_does_not_count(n_points):
     kappa = np.linspace(0.0, 2.0, n_points)[:, None]
@@ -274,6 +278,7 @@ def test_a_variable_of_one_value_does_not_count(n_points):
     np.testing.assert_allclose(two.predict(beside), one.predict(FINE), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1, 2])
 def test_three_points_tell_a_pole_that_bends_all_parameters(times):
     """A pendulum of three lengths; a parabola that meets them is off by a sixth."""
@@ -314,7 +319,7 @@ def test_entries_that_are_noise_hide_no_law_of_one(seed):
     np.testing.assert_allclose(pole, -0.05 / np.sqrt(between), rtol=0.02)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_variable_that_tells_nothing_is_left_out(seed):
     """A supply voltage, say, that is nearly constant; six points tell of no plane."""

@@ -46,7 +46,7 @@ def test_linear_outputs_have_exact_deviations(form):
     np.testing.assert_allclose(std[:, 0] ** 2, np.sum((J @ P) * J, axis=1), atol=1e-15)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("rates", [False, True])
 def test_deviations_are_those_of_draws(name, rates):

@@ -207,6 +207,7 @@ def test_a_denominator_with_a_zero_in_the_range_is_refused():
         model.with_coefficients(c)
 
 
+@pytest.mark.slow
 def test_information_is_the_inverse_covariance_of_the_coefficients():
     rng = np.random.default_rng(3)
     roots = 0.05 * rng.normal(size=(7, 2, 2)) + 0.1 * np.eye(2)

@@ -13,6 +13,7 @@ from .conftest import assert_same_matrices, lpv_model
 from .test_coefficients import FORMS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_scheduling", [1, 2, 3])
 @pytest.mark.parametrize("form", FORMS, ids=str)
 @pytest.mark.parametrize("normalized", [False, True])

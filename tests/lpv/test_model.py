@@ -82,6 +82,7 @@ def sweep(n_samples):
     return 1 - np.cos(np.linspace(0, 5, n_samples))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_samples", [1, 2, 20, 700])
 def test_simulation_is_the_loop(n_samples):
     model, u, kappa = spring(), inputs(n_samples), sweep(n_samples)
@@ -102,6 +103,7 @@ def test_constant_scheduling_is_the_sampled_model_exactly(kappa, n_samples, seed
     assert_allclose(y, local, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_noisy_scheduling_is_the_loop():
     model, u = spring("ignore"), inputs(600)
     kappa = sweep(600) + 0.05 * np.random.default_rng(1).normal(size=600)
@@ -110,12 +112,14 @@ def test_noisy_scheduling_is_the_loop():
     assert_allclose(y, expected, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_scheduling_that_jumps_back_in_time_is_not_reordered():
     model, u, kappa = spring(), inputs(300), sweep(300)
     expected = loop(model, u, kappa[::-1], np.zeros(2))
     assert_allclose(model.simulate(u, kappa[::-1], DT), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_samples", [30, 400])
 def test_two_scheduling_variables(n_samples):
     model, u = two_variables(), inputs(n_samples)
@@ -128,6 +132,7 @@ def test_two_scheduling_variables(n_samples):
     assert_allclose(model.simulate(u, held, DT), local, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_interpolators_that_are_not_smooth():
     kappa = np.linspace(0, 2, 6)[:, None]
     theta = spring().parameters(kappa)
@@ -147,6 +152,7 @@ def test_blocks_of_samples_join_without_a_seam(monkeypatch):
     assert_allclose(model.free_responses(kappa, DT), free, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_inputs_that_go_on_linearly_are_those_of_many_more_samples(monkeypatch):
     """Held over the middles of these, by which outputs are exact to second order."""
     monkeypatch.setattr(model_module, "_BLOCK", 64)
@@ -636,6 +642,7 @@ def test_at_rest_nothing_moves():
     assert_allclose(y, model.output_offset(kappa), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_simulation_about_offsets_is_the_loop():
     model, u, kappa = about_offsets(), inputs(300), sweep(300)
     x, expected = offsets_of(kappa[0])[0, 4:], []
@@ -761,6 +768,7 @@ def test_rate_terms_are_those_of_a_change_of_basis():
     assert "with rate terms" in repr(moved)
 
 
+@pytest.mark.slow
 def test_rate_terms_follow_the_trajectory():
     model, kappa, u = spring(), sweep(300), inputs(300)
     moved = with_rates(model, lambda k: [[0.1 * k, 0], [-k, 0.2 * k**2]])

@@ -56,6 +56,7 @@ def test_exact_data_give_the_true_coefficients():
     np.testing.assert_allclose(found.own, [[0.3, -1.0]] * 2, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_exact_rate_terms_are_found():
     truth, kinematic = with_rate_terms(spring_lpv())
     c = coefficients_of(truth)
@@ -72,6 +73,7 @@ def test_exact_rate_terms_are_found():
     np.testing.assert_allclose(coefficients_of(found.model), c, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_rate_terms_that_are_not_there_are_left_out():
     truth = spring_lpv()
     kept = []
@@ -179,6 +181,7 @@ def test_errors_are_as_large_as_their_covariance_says():
     assert 9 * 0.7 < np.mean(distances) < 9 * 1.4
 
 
+@pytest.mark.slow
 def test_outputs_weigh_by_their_noise():
     """An output a hundred times as noisy does not spoil what the other one tells."""
     structure = GrayBoxStructure.from_template(
@@ -199,6 +202,7 @@ def test_outputs_weigh_by_their_noise():
     assert np.mean(errors[2]) < 2 * np.mean(errors[1])
 
 
+@pytest.mark.slow
 def test_steps_that_diverge_are_rejected():
     """From far away: full steps lead to negative stiffness or no model at all."""
     truth = spring_lpv()
@@ -232,6 +236,7 @@ def test_a_start_that_diverges_is_told():
         refine(bad, [record(truth, 3000)], REST)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refused", [1, 3])
 def test_steps_whose_derivatives_would_not_end_are_rejected(monkeypatch, refused):
     truth, calls, whole = spring_lpv(), [], refinement._gram

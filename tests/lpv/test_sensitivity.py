@@ -86,6 +86,7 @@ def slopes_and_differences(model, n_samples=60, dt=STEP):
     return np.concatenate(slopes), np.stack(columns, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("rates", [False, True])
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
@@ -123,6 +124,7 @@ def test_slopes_of_runs_that_begin_where_their_inputs_hold_them(name, rates):
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_long_tables_and_short_ones_agree(monkeypatch):
     """With 300 samples matrices and directions come from a table over kappa."""
     found, expected = slopes_and_differences(with_function(), 300)

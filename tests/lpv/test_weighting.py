@@ -83,6 +83,7 @@ def test_a_form_is_chance_by_its_misfit_per_degree_of_freedom():
     assert not is_chance(241.0, 60)
 
 
+@pytest.mark.slow
 def test_precise_points_count_more_where_the_polynomial_is_true():
     rng = np.random.default_rng(4)
     deviation = np.where(np.arange(6) % 3 == 1, 0.2, 0.01)[:, None]

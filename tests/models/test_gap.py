@@ -54,6 +54,7 @@ def transposed(G):
     return StateSpace(G.A.T, G.C.T, G.B.T, G.D.T, G.sampling_time)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [None, 0.5])
 def test_gap_is_its_definition(dt):
     rng, n_apart = np.random.default_rng(3), 0

@@ -34,6 +34,7 @@ def moving():
     return OutputErrorLPV(spring_lpv(), **ROLES).fit(X, y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["local", "moving"])
 def test_parts_add_up(name, request):
     model = request.getfixturevalue(name)
@@ -68,6 +69,7 @@ def test_tables_where_they_are_wanted(local):
         np.testing.assert_array_equal(found, plain)
 
 
+@pytest.mark.slow
 def test_rows_may_be_lists():
     X, y = sweeps()
     X["run"] = X["run"].str[-1].astype(int)
@@ -105,6 +107,7 @@ def test_single_outputs(memory):
     assert model.output_errors_.index.tolist() == ["position"]
 
 
+@pytest.mark.slow
 def test_scales_of_outputs_scale_bands(memory, local):
     X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES)
     large = spring_pipeline(memory=memory).fit(X, 1e3 * y)
@@ -119,6 +122,7 @@ def test_scales_of_outputs_scale_bands(memory, local):
     np.testing.assert_allclose(theirs[1:], 1e3 * ours[1:], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_what_is_not_known_is_refused_with_the_remedy(memory):
     X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES)
     new, _ = spring_sweep(50)
@@ -134,6 +138,7 @@ def test_what_is_not_known_is_refused_with_the_remedy(memory):
         assert np.isfinite(model.output_errors_).all(axis=None)
 
 
+@pytest.mark.slow
 def test_the_refiner_hands_its_covariance_and_errors_on(memory):
     tables = zip(spring_tables(noise=0.05, n_samples=N_SAMPLES), sweeps(), strict=True)
     X, y = (pd.concat(pair, ignore_index=True) for pair in tables)

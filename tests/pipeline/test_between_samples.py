@@ -95,6 +95,7 @@ def test_several_realizations_tell_it_too(combine):
     np.testing.assert_allclose(given.parameters_, model.parameters_, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_ramps_without_noise_are_found():
     X, y = table("foh", noise=0.0)
     model = pipeline().fit(X, y)
@@ -113,6 +114,7 @@ def test_states_that_noise_has_do_not_lead_astray_beyond_the_nyquist_frequency(
     assert model.lpv_.hold == "foh" and off(model) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_lead_is_no_ramp_where_inputs_are_seen_to_stay():
     """Outputs that are read half a sample after the inputs look like that."""
@@ -139,6 +141,7 @@ def test_most_points_decide():
     assert _meets_more(better, worse) and not _meets_more(worse, better)
 
 
+@pytest.mark.slow
 def test_held_inputs_stay_held():
     X, y = table("zoh")
     model = pipeline().fit(X, y)
@@ -147,7 +150,7 @@ def test_held_inputs_stay_held():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [3.0, 30.0])
 def test_what_a_structure_lacks_is_no_ramp(lag):
     """A lag before the spring, of which the structure knows nothing."""

@@ -96,7 +96,7 @@ def vanishing(place, kappas):
     return from_trajectories(runs, sampling_time=STEP)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "n_points", "order", "most"),
     [(2, 5, "auto", 0.05), (4, 5, "auto", 0.05), (2, 6, 4, 0.05), (1, 3, "auto", 0.1)],
@@ -212,6 +212,7 @@ def test_states_of_a_record_that_hardly_decay_within_it_are_not_told():
 
 
 # A state that is rounding has its pole anywhere.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the identified model of order 2 has 1 pole")
 @pytest.mark.parametrize("vanishes", [0, 1, 2])
 def test_a_mode_that_exact_records_do_not_have_at_a_point_is_foreseen(vanishes):

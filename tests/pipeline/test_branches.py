@@ -49,6 +49,7 @@ def smooth_parts(rng, x, n_parts, n_each):
     return a + b * x + c * x**2
 
 
+@pytest.mark.slow
 def test_families_stay_whole_or_are_doubted():
     wrong = 0
     for seed in range(40):
@@ -171,6 +172,7 @@ def modes_pipeline(structure=MODES, seed=0, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("efficient", [True, False])
 def test_modes_keep_their_places_between_points(seed, efficient):
@@ -198,6 +200,7 @@ def test_modes_keep_their_places_between_points(seed, efficient):
     assert (ratio > 1.0).all()  # standard deviations stay with their modes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slow", "fast"), ["12", "21"])
 def test_what_is_known_of_the_parts_numbers_them(slow, fast):
     X, y = modes_tables((0.0, 1.0))
@@ -209,6 +212,7 @@ def test_what_is_known_of_the_parts_numbers_them(slow, fast):
         assert (found[f"w2_{slow}"] < found[f"w2_{fast}"]).all()
 
 
+@pytest.mark.slow
 def test_choices_are_kept_in_a_memory(tmp_path):
     X, y = modes_tables((0.0, 2.0))
     options = {"memory": tmp_path, "interpolator": PolynomialLPV(1)}
@@ -240,6 +244,7 @@ def lags(structure, *, n_points=8, init="similarity", memory=None):
     return pipeline.fit(np.vstack(inputs), np.vstack(outputs))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
 @pytest.mark.parametrize("n_points", [1, 8])
 def test_parameters_with_other_values_at_all_points_are_told(n_points):
@@ -250,13 +255,14 @@ def test_parameters_with_other_values_at_all_points_are_told(n_points):
     assert sum("have other values" in str(w.message) for w in caught) == 1
 
 
+@pytest.mark.slow
 def test_bounds_for_all_parts_leave_one_family():
     """Whose parts exchanged at all points it is still: a warning would be an error."""
     bounds = dict.fromkeys(MODES.parameter_names, (-99.0, 99.0))
     modes_pipeline(MODES.with_bounds(bounds)).fit(*modes_tables(range(4)))
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("g", [0.02, 0.03])
 @pytest.mark.parametrize("known", ["range", "bound", "guess"])
 def test_what_is_known_of_them_tells_which_is_which(known, g, memory):
@@ -317,7 +323,7 @@ def coils_pipeline(structure, memory, refiner=None, **options):
     )
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "varies, names", [(1, ()), (2, ("rotor", "motor", "friction", "load"))]
 )
@@ -337,6 +343,7 @@ def test_experiments_that_move_choose_among_mirror_images(varies, names, memory)
     assert spread.argmax() + 1 == varies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [(), ("rotor", "motor", "friction", "load")])
 def test_mirror_images_that_nothing_tells_apart_are_told(names, memory):
     """Once: what each operating point says of it is not said again."""
@@ -346,6 +353,7 @@ def test_mirror_images_that_nothing_tells_apart_are_told(names, memory):
     assert len(caught) == 1
 
 
+@pytest.mark.slow
 def test_a_guess_tells_mirror_images_apart(memory):
     found = coils_pipeline(coils(), memory, init=[9.0, 6.0, 0.7, 0.5])
     spread = found.fit(*two_coils(1, n_sweeps=0)).parameters_.std()
@@ -355,18 +363,21 @@ def test_a_guess_tells_mirror_images_apart(memory):
 WRONG_IF_2_VARIES = [9.0, 6.0, 0.7, 0.5]  # a guess, which no frozen model refutes
 
 
+@pytest.mark.slow
 def test_a_refined_model_that_misses_its_own_record_is_told(memory):
     pipeline = coils_pipeline(coils(), memory, OutputErrorLPV(), init=WRONG_IF_2_VARIES)
     with pytest.warns(UserWarning, match="refined model misses .* in the experiments"):
         pipeline.fit(*two_coils(2, n_sweeps=1, fast=8))
 
 
+@pytest.mark.slow
 def test_a_refined_model_of_a_noisy_record_is_not_said_to_miss_it(memory):
     """A warning would be an error."""
     pipeline = coils_pipeline(coils(), memory, OutputErrorLPV(), init=WRONG_IF_2_VARIES)
     pipeline.fit(*two_coils(1, n_sweeps=1, noise=0.1))
 
 
+@pytest.mark.slow
 def test_parts_that_are_the_same_at_all_points_have_no_mirror_image(memory):
     """No state depends on their order then; gains may vary."""
     structure = GrayBoxStructure.from_template(
@@ -383,6 +394,7 @@ def test_parts_that_are_the_same_at_all_points_have_no_mirror_image(memory):
     )
 
 
+@pytest.mark.slow
 def test_a_lag_that_may_have_any_of_several_poles_is_told():
     """No permutation of the parameters: the rest of the model follows."""
     structure = GrayBoxStructure.from_template(

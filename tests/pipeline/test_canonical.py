@@ -81,7 +81,7 @@ def test_a_low_form_that_foresees_the_points_is_taken():
     assert ours > 99.0 > 90.0 > theirs
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("units", [1e-6, 1e5])
 def test_units_do_not_choose(units):
     model = pipeline().fit(*tables(pendulum, 5, units=units))
@@ -92,7 +92,7 @@ def slight_pendulum(kappa):
     return pendulum(0.3 * kappa)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("system, n_points", [(slight_pendulum, 3), (two_modes, 5)])
 def test_where_no_low_form_is_told_black_boxes_are_aligned(system, n_points):
     """Of three points any parabola goes through, and tells nothing."""
@@ -149,6 +149,7 @@ def test_a_parabola_through_any_three_points_is_told():
     assert pipeline(GrayBoxRestructurer()).fit(X, y).interpolator_.form_
 
 
+@pytest.mark.slow
 def test_a_curve_through_the_points_is_one_through_aligned_models():
     model = pipeline(interpolator=SplineLPV()).fit(*tables(pendulum, 5))
     assert list(model.parameters_)[0] == "a1_1"
@@ -189,7 +190,7 @@ def position(u, kappa):
     return np.array(drive)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed, bend", [(0, 1.0), (0, 3.0)])
 def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed, bend):
     rng = np.random.default_rng(seed)

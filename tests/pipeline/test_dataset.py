@@ -35,7 +35,7 @@ def assert_same_fit(one, other):
     assert [*one.feature_names_in_] == [*other.feature_names_in_]
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     X, y = tables

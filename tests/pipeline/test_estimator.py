@@ -70,6 +70,7 @@ def test_prediction_is_the_simulation_of_the_lpv_model(fitted, spring):
     np.testing.assert_array_equal(fitted.predict(X), direct)
 
 
+@pytest.mark.slow
 def test_order_of_experiments_does_not_matter(fitted, spring):
     X, y, X_sweep, _ = spring
     order = np.concatenate([X.index[X["run"] == f"p{k}r0"] for k in (2, 0, 3, 1)])
@@ -108,6 +109,7 @@ def test_baseline_without_structure_is_worse(fitted, spring, memory):
     assert score < bft_score(y_sweep, fitted.predict(X_sweep)) - 1
 
 
+@pytest.mark.slow
 def test_black_boxes_are_aligned_where_that_is_asked_for(fitted, spring):
     X, y, X_sweep, y_sweep = spring
     pipeline = LocalLPVPipeline(
@@ -177,6 +179,7 @@ def test_points_of_few_samples_count_by_their_covariances():
     assert errors[0] < errors[1] / 1.5
 
 
+@pytest.mark.slow
 def test_sub_estimators_are_cloned(spring):
     X, y, _, _ = spring
     pipeline = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV(1))
@@ -220,6 +223,7 @@ def test_one_operating_point_is_a_time_invariant_model(spring):
     np.testing.assert_allclose(pipeline.predict(X[one]), y[one], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_arrays_take_positions_as_roles(fitted, spring):
     X, y, _, _ = spring
     numbers = X.assign(run=X["run"].astype("category").cat.codes).to_numpy(float)
@@ -233,6 +237,7 @@ def test_arrays_take_positions_as_roles(fitted, spring):
     assert pipeline.predict(numbers).shape == (len(X),)
 
 
+@pytest.mark.slow
 def test_sampling_time_without_a_time_column(fitted, spring):
     X, y, X_sweep, _ = spring
     roles = {"scheduling": "kappa", "experiment": "run"}
@@ -246,6 +251,7 @@ def test_sampling_time_without_a_time_column(fitted, spring):
     assert not np.allclose(fitted.predict(finer), fitted.predict(X_sweep), atol=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 def test_tustin_warps_what_zero_order_hold_does_not(fitted, spring):
     X, y, _, _ = spring
@@ -254,6 +260,7 @@ def test_tustin_warps_what_zero_order_hold_does_not(fitted, spring):
     assert 1e-4 < error < 0.1
 
 
+@pytest.mark.slow
 def test_progress_goes_to_stderr_only(spring, capsys):
     X, y, _, _ = spring
     spring_pipeline(verbose=1).fit(X, y)
@@ -262,6 +269,7 @@ def test_progress_goes_to_stderr_only(spring, capsys):
     assert "local models" in captured.err and "restructuring" in captured.err
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:any 3 points lie on a form")
 @pytest.mark.filterwarnings("ignore:The (identified )?model")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
@@ -391,6 +399,7 @@ def test_the_interpolators_own_warning_is_not_added(spring, memory):
     assert len(caught) == 1
 
 
+@pytest.mark.slow
 def test_motion_seen_in_local_experiments_is_within_the_range():
     X, y = spring_tables()
     rng = np.random.default_rng(0)
@@ -436,6 +445,7 @@ def test_two_points_carry_a_line_by_default(spring, memory):
 # -------------------------------------------------------------------- tables and arrays
 
 
+@pytest.mark.slow
 def test_read_only_and_memory_mapped_arrays(fitted, spring, tmp_path):
     X, y, _, _ = spring
     numbers = X.assign(run=X["run"].astype("category").cat.codes).to_numpy(float)
@@ -477,6 +487,7 @@ def test_names_of_columns_are_kept_and_checked(fitted, spring):
         fitted.predict(X.rename(columns={"force": "u"}))
 
 
+@pytest.mark.slow
 def test_columns_of_a_multiindex_take_roles(fitted, spring, memory):
     X, y, X_sweep, y_sweep = spring
     names = {"force": ("in", "force"), "kappa": ("set", "kappa")}
@@ -508,7 +519,7 @@ def test_html_shows_the_steps_before_and_after_fitting(fitted):
     assert "PolynomialLPV" in nested._repr_html_()
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     X, y = spring_tables(n_repeats=2)
@@ -641,6 +652,7 @@ def about_zero(spring):
     return spring_pipeline(local=SubspaceLTI(offset=None)).fit(X, y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "structure", [None, pytest.param(spring_structure(), marks=pytest.mark.slow)]
 )
@@ -684,6 +696,7 @@ def test_a_model_without_offsets_says_what_it_misses(spring):
         assert pipeline.lpv_.offsets is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("detrend", ["constant", "linear"])
 def test_detrend_of_the_local_step_is_honoured(spring, detrend):
     X, y, X_sweep, y_sweep = spring
@@ -723,6 +736,7 @@ def test_a_system_that_stands_about_offsets(with_structure, bar):
     np.testing.assert_allclose(again, simulated, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_constants_that_differ_at_one_point_are_told():
     X, y = spring_tables(noise=0.02, n_repeats=2, seed=3, kappas=KAPPA[:2])
     level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
@@ -750,6 +764,7 @@ def late_springs(delays, noise=0.02):
     return X, pd.DataFrame(np.vstack(parts), columns=["position"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("input_delay", [5, "auto"])
 def test_a_delay_of_the_input_does_not_bend_the_parameters(input_delay):
     X, y = late_springs([5] * 4)
@@ -769,6 +784,7 @@ def test_a_delay_of_the_input_does_not_bend_the_parameters(input_delay):
     assert "Input delay: 5 sample(s)" in pipeline.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"combine": "average"}, {"efficient": False}])
 def test_delays_go_along_with_the_options(options):
     X, y = late_springs([3] * 4, noise=0.0)
@@ -807,6 +823,7 @@ def test_points_tell_a_delay_together():
     np.testing.assert_allclose(pipeline.parameters_["a"], rates, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_no_delay_is_imagined():
     X, y = late_springs([0] * 4)
     pipeline = spring_pipeline(local=SubspaceLTI(input_delay="auto")).fit(X, y)
@@ -815,6 +832,7 @@ def test_no_delay_is_imagined():
     assert "Input delay" not in pipeline.summary()
 
 
+@pytest.mark.slow
 def test_delays_that_differ_between_points_are_told():
     X, y = late_springs([5, 5, 6, 5])
     local = SubspaceLTI(input_delay="auto")
@@ -851,6 +869,7 @@ def test_steps_that_last_are_told_where_wanted(capsys, monkeypatch, verbose, bar
     assert watch.seconds["figures"] >= 0.1
 
 
+@pytest.mark.slow
 def test_points_of_which_no_sample_is_left_are_told():
     X, y = spring_tables(kappas=[0.0, 0.5, 1.0, 1.5], n_samples=200)
     y = y.copy()
@@ -868,7 +887,7 @@ def test_a_restructurer_in_the_first_place_is_named():
         wrong.fit(X, y)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("structured", [True, False])
 def test_points_of_work_are_where_drifts_begin(structured):
     """Of outputs that drift by as much as they move, about a level."""

@@ -70,6 +70,7 @@ def fitted(spring):
     return spring_pipeline(local=SubspaceLTI(2, horizon=8)).fit(*spring[:2])
 
 
+@pytest.mark.slow
 def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_path):
     X, y = spring[2:]
     page, text = page_of(
@@ -89,6 +90,7 @@ def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_pa
     assert len(figures) == 3 + 1 + 1 + 3 + 1 + 1
 
 
+@pytest.mark.slow
 def test_units_of_the_pipeline_reach_its_pages_pictures_and_files(spring, tmp_path):
     X, y = spring[:2]
     units = {"position": "mm", "kappa": "kg", "force": "N", "k": "1/s2"}
@@ -113,6 +115,7 @@ def test_units_of_the_pipeline_reach_its_pages_pictures_and_files(spring, tmp_pa
         bad.fit(X, y)
 
 
+@pytest.mark.slow
 def test_without_a_table_it_tells_of_the_fit_alone(fitted, tmp_path):
     text = page_of(fitted, tmp_path / "report.html", title="A < B & C")[1]
     assert "<title>A &lt; B &amp; C</title>" in text

@@ -85,6 +85,7 @@ def error_at_order_two(records, truth, **options):
     return point.order, np.linalg.norm(G - H) / np.linalg.norm(H)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seeds", [(11,), pytest.param((22, 24, 25), marks=pytest.mark.slow)]
 )

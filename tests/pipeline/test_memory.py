@@ -109,6 +109,7 @@ def test_slow_writing_of_the_memory_is_not_told_to_the_user(tmp_path, monkeypatc
         line_pipeline(memory=tmp_path).fit(X, y)
 
 
+@pytest.mark.slow
 def test_memory_is_a_folder_a_path_or_a_joblib_memory(tmp_path):
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
     expected = line_pipeline().fit(X, y)
@@ -136,6 +137,7 @@ def test_memory_teaches_what_it_cannot_be(tmp_path):
             line_pipeline(memory=place).fit(X, y)
 
 
+@pytest.mark.slow
 def test_steps_that_cannot_be_pickled_are_not_kept_and_said(tmp_path):
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
     truth = spring_structure()
@@ -259,6 +261,7 @@ def test_what_cannot_be_told_apart_is_not_kept_and_said(tmp_path, calls):
     assert len(calls) == 2
 
 
+@pytest.mark.slow
 def test_a_structure_whose_function_was_edited_is_restructured_anew(written, tmp_path):
     text = """
 def matrices(theta):

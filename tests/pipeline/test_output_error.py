@@ -123,6 +123,7 @@ def test_a_refiner_needs_coefficients(both, memory):
         pipeline.fit(*both[1])
 
 
+@pytest.mark.slow
 def test_the_prior_may_be_certain(both, memory):
     plain = spring_pipeline(memory=memory).fit(*both[0])
     held = spring_pipeline(memory=memory, refiner=OutputErrorLPV(prior=1e12))
@@ -143,6 +144,7 @@ def test_without_a_structure_local_experiments_are_the_prior(both, memory):
     assert (pipeline.refiner_.report_["BFT"] > 96.5).all()
 
 
+@pytest.mark.slow
 def test_the_prior_leaves_out_what_is_missing_of_local_experiments(both):
     X, y = both[1]
     y = y.copy()
@@ -377,7 +379,7 @@ def test_constants_that_are_missing_are_told():
     assert not OutputErrorLPV(spring_structure(), **roles).fit(X, y).offsets_.any()
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [-1.0, 1000.0])
 def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
     """Constants do not stand for it: local experiments hold the model."""
@@ -398,6 +400,7 @@ def test_a_delay_that_is_missing_is_told():
         OutputErrorLPV(spring_structure(), **roles).fit(X, late)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", ["auto", True])
 def test_a_gain_without_states_has_no_rate_terms(rate):
     rng = np.random.default_rng(0)

@@ -82,6 +82,7 @@ def test_the_report_holds_the_parameters_and_their_interpolation(fitted):
     assert report["interpolation_error"].iloc[k] == pytest.approx(relative)
 
 
+@pytest.mark.slow
 def test_the_fit_of_parameters_does_not_depend_on_units():
     """Of time, say: the largest number would decide."""
     X, y = spring_tables(noise=0.01, n_samples=300)
@@ -107,6 +108,7 @@ def test_parameters_are_reported_one_by_one(fitted):
     np.testing.assert_array_equal(report["std"], fitted.parameters_std_.median())
 
 
+@pytest.mark.slow
 def test_what_an_interpolation_loses_at_the_points_is_reported(fitted):
     report = fitted.report_
     np.testing.assert_allclose(report["lpv_BFT"], report["structured_BFT"], atol=0.5)
@@ -128,6 +130,7 @@ def test_standard_deviations_are_reported_where_they_are_known(uncertain):
     assert " std" in uncertain.summary()
 
 
+@pytest.mark.slow
 def test_deviations_are_missing_where_they_are_not_known():
     rough = SubspaceLTI(order=2, horizon=10, refine=False)
     pipeline = spring_pipeline(local=rough).fit(*spring_tables(0.05, n_samples=200))
@@ -188,6 +191,7 @@ def test_the_summary_tells_what_was_found(fitted, balanced):
     assert "no common state basis" in balanced.summary()
 
 
+@pytest.mark.slow
 def test_stamps_that_are_off_are_told():
     X, y = spring_tables(n_samples=100)
     assert "Time stamps" not in spring_pipeline().fit(X, y).summary()
@@ -208,6 +212,7 @@ class Careless(AutoLPV):
         )
 
 
+@pytest.mark.slow
 def test_points_that_a_form_of_nobodys_choice_misses_are_told():
     X, y = spring_tables(n_samples=200, noise=0.01)
     with pytest.warns(UserWarning, match=r"point\(s\) 3 \(scheduling 1.5: .* 1 more"):

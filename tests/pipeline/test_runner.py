@@ -98,6 +98,7 @@ def run(n_points, *, verbose=0, n_jobs=None, on_error="raise"):
     return runner.run("steps", noisy, arguments, np.arange(float(n_points))[:, None])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_jobs", [None, 2])
 def test_what_points_warn_of_comes_with_their_results(n_jobs):
     found = run(3, n_jobs=n_jobs)  # a warning would be an error
@@ -147,6 +148,7 @@ def test_what_differs_in_numbers_is_told_once_with_their_ranges():
     ]
 
 
+@pytest.mark.slow
 def test_a_progress_bar_stays_whole(capsys):
     """Warnings come after the bar, once, at the points that they are about."""
     X, y = spring_tables(n_samples=150)

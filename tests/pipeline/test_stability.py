@@ -60,6 +60,7 @@ def test_integrators_are_no_growth():
     np.testing.assert_array_equal(growth_rates(lpv, KAPPA, 1e3), 0.0)
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_growth_rate():
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0, 2.0))
     pipeline = spring_pipeline().fit(X, y)

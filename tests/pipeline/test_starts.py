@@ -89,6 +89,7 @@ def test_without_a_structure_matrices_are_affine_in_the_scheduling():
     assert model.predict(X).shape == y.shape
 
 
+@pytest.mark.slow
 def test_without_scheduling_it_is_an_output_error_model():
     X, y = spring_tables(noise=0.05, kappas=[1.0], n_samples=300)
     roles = {"inputs": "force", "time": "time"}

@@ -86,6 +86,7 @@ def short_springs():
     return X, y, spring_pipeline().fit(X, y).parameters_std_
 
 
+@pytest.mark.slow
 def test_more_experiments_tell_more(short_springs):
     X, y = spring_tables(0.05, n_samples=300, n_repeats=4)
     ratio = short_springs[2] / spring_pipeline().fit(X, y).parameters_std_
@@ -106,6 +107,7 @@ def test_deviations_are_the_spread_over_new_noise():
     assert ratio.between(0.65, 1.5).all()
 
 
+@pytest.mark.slow
 def test_deviations_follow_the_units(short_springs):
     X, y, one = short_springs
     other = spring_pipeline().fit(X, 1000.0 * y).parameters_std_
@@ -269,6 +271,7 @@ def test_one_order_with_integrators_is_that_of_all_points():
     assert pipeline.report_["local_BFT"].min() > 99.0
 
 
+@pytest.mark.slow
 def test_the_rates_of_a_double_integrator_have_one_integrator():
     structure = GrayBoxStructure.from_template([[0, 1], [0, 0]], [[0], ["b"]], [[1, 0]])
     rng, runs = np.random.default_rng(0), []
@@ -361,6 +364,7 @@ def sensor_pipeline(**options):
     return LocalLPVPipeline(local, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discretization", ["zoh", "foh", "tustin"])
 def test_efficient_parameters_are_those_of_maximum_likelihood(discretization):
     u, y, size = sensor_record(0, method=discretization)
@@ -404,6 +408,7 @@ def test_what_another_norm_asks_for_stays(options):
     assert pipeline.parameters_std_.notna().all(axis=None)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
 def test_realizations_are_weighed_together():
     records = [sensor_record(seed)[:2] for seed in range(3)]
@@ -442,6 +447,7 @@ def test_without_a_covariance_the_hinf_optimum_is_kept():
 # -- time and wrong options ------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_max_time_is_shared_by_the_points_and_told():
     X, y = spring_tables(noise=0.02, n_samples=300, kappas=KAPPA[::3])
     pipeline = spring_pipeline(
@@ -484,6 +490,7 @@ def with_a_mode_that_vanishes(c2):
     return StructuredModels(points, local, structure, theta, known, models, [])
 
 
+@pytest.mark.slow
 def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
     true = with_a_mode_that_vanishes(np.linspace(-20.0, 20.0, 7))
     theta, covariance = true.theta.copy(), true.covariance.copy()
@@ -507,6 +514,7 @@ def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
     np.testing.assert_array_equal(kept.theta, bent)
 
 
+@pytest.mark.slow
 def test_a_mode_that_vanishes_is_foreseen_as_a_whole():
     """Its stiffness is sure only by what is wrong of its gain and damping."""
     true = with_a_mode_that_vanishes(np.linspace(-20.0, 20.0, 7))

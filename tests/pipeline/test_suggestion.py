@@ -36,6 +36,7 @@ def fitted(memory):
     return fit
 
 
+@pytest.mark.slow
 def test_a_form_that_is_true_leaves_only_noise(fitted):
     """Without noise nothing moves, whichever of the four points is left out."""
     pipeline = fitted(PolynomialLPV(2))
@@ -48,6 +49,7 @@ def test_a_form_that_is_true_leaves_only_noise(fitted):
     assert table["uncertainty"].is_monotonic_decreasing
 
 
+@pytest.mark.slow
 def test_a_form_that_is_not_true_is_least_certain_where_it_bends(fitted):
     """A straight line for a parabola: near an end, where a point is missed most."""
     table = suggest_operating_point(fitted(PolynomialLPV(1)))
@@ -76,6 +78,7 @@ def test_units_of_signals_do_not_matter(fitted, scale):
     assert_allclose(other[columns], plain[columns], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_neighbour_gaps_are_those_of_models_with_gains_of_one(fitted):
     pipeline = fitted(PolynomialLPV(2))
     table = suggest_operating_point(pipeline, criterion="neighbour_gap")
@@ -90,6 +93,7 @@ def test_neighbour_gaps_are_those_of_models_with_gains_of_one(fitted):
     assert_allclose(table["neighbour_gap"][0], gap(one, other), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_where_every_point_is_needed_the_gap_ranks(fitted):
     """A cubic through four points: none can be left out, and noise is not known."""
     table = suggest_operating_point(fitted(PolynomialLPV(3)))
@@ -134,6 +138,7 @@ def test_two_scheduling_variables():
     assert {tuple(np.round(place, 6)) for place in found} == sides | spokes
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:4 operating points determine")
 @pytest.mark.filterwarnings("ignore:3 operating points determine")
 @pytest.mark.filterwarnings("ignore:the scheduling variables .* move together")

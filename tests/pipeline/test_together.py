@@ -42,6 +42,7 @@ def boxes(estimates):
     return [UncertainBoxes.of(LAGS, own) for own in estimates]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discrete", [False, True])
 def test_the_polynomial_of_exact_black_boxes_is_found_from_afar(discrete):
     estimates = [[estimate(theta, discrete)] for theta in TRUTH]
@@ -72,6 +73,7 @@ def structured(theta, covariance):
     return StructuredModels(points, local, LAGS, theta, covariance, models, [None] * 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknown", [np.diag([np.inf] * 4), np.full((4, 4), 1e8)])
 def test_it_is_taken_where_a_point_does_not_determine_its_parameters(unknown):
     theta, P = TRUTH.copy(), np.array([np.diag((STD * row) ** 2) for row in TRUTH])
@@ -89,6 +91,7 @@ def test_it_is_taken_where_a_point_does_not_determine_its_parameters(unknown):
         assert (model - LAGS.model(row)).hinf_norm() < 1e-4
 
 
+@pytest.mark.slow
 def test_nothing_is_taken_that_the_black_boxes_refute_or_do_not_know():
     rng = np.random.default_rng(0)
     wild = TRUTH * np.exp(rng.normal(size=TRUTH.shape))
@@ -99,6 +102,7 @@ def test_nothing_is_taken_that_the_black_boxes_refute_or_do_not_know():
     assert fitted_together(LAGS, [None] * 5, KAPPA, TRUTH) is None
 
 
+@pytest.mark.slow
 def test_a_form_that_the_black_boxes_refute_is_not_kept():
     """It is as near to the parameters as a covariance asks that tells too little."""
     P = np.tile(0.2 * np.eye(4), (5, 1, 1))
@@ -109,6 +113,7 @@ def test_a_form_that_the_black_boxes_refute_is_not_kept():
     assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deviations", [0.0, 10.0])
 def test_parameters_near_a_form_that_foresees_no_more_are_on_a_smooth_function(
     deviations,

@@ -253,6 +253,7 @@ def test_hinf_norm_is_smaller_than_with_the_bilinear_equations(rough):
     assert hinf.error_ < bilinear.error_
 
 
+@pytest.mark.slow
 def test_covariance_of_the_parameters_predicts_their_spread():
     structure, params = CASES["spring_mass"]
     theta = structure.check_params(params)
@@ -363,6 +364,7 @@ def test_restarts_from_perturbations_agree():
     assert (table.drop(columns="error_").abs() < 1e-6).all(axis=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -533,6 +535,7 @@ def test_scikit_learn_conventions():
     assert not hasattr(restructurer, "params_")
 
 
+@pytest.mark.slow
 def test_result_is_reproducible(rough):
     black_box, fitted = far_fit(1)
     first, second = (
@@ -947,6 +950,7 @@ def test_a_parameter_of_zero_is_perturbed_too():
     assert np.abs(found.to_numpy()).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signs", [(1, 1, -1), (1, -1, 1), (-1, 1, 1)])
 def test_signs_that_nothing_tells_are_tried(signs):
     """M = I + p p.T: first guesses of one sign, and no factor leads to others."""

@@ -233,6 +233,7 @@ def test_other_norms(norm):
     np.testing.assert_allclose(fitted.params_, [3.0, 2.0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_realizations_of_servos_have_a_covariance():
     rng = np.random.default_rng(0)
     truth = np.array([3.0, 2.0])
@@ -407,6 +408,7 @@ def _sampled():
     return ALTERNATING, 0.1, [target_of(ALTERNATING.model(theta, 0.1))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fast", [1e3, 1e8])
 def test_slow_poles_beside_fast_ones_are_not_known(fast):
     structure = template(

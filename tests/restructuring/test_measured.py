@@ -170,6 +170,7 @@ def test_reflected_poles_meet_the_response_as_well_as_they_can():
     assert np.isclose(np.linalg.norm(own - G), least, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the response determines")
 @pytest.mark.parametrize("seed", range(5))
 def test_orders_beyond_the_systems_and_noise_raise_nothing(seed):
@@ -265,6 +266,7 @@ def test_errors_count_in_standard_deviations_of_the_noise():
     assert ((table["lower"] < [2, 3]) & (table["upper"] > [2, 3])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 6])
 @pytest.mark.filterwarnings("ignore")
 def test_fewer_data_than_parameters_raise_nothing(count):

@@ -227,6 +227,7 @@ def test_a_search_that_comes_down_to_the_floor_is_at_an_optimum(seed):
     assert 0.0 < fitted.remaining_error_ < gain
 
 
+@pytest.mark.slow
 def test_what_remains_below_a_floor_is_minimised_from_where_it_was_met(monkeypatch):
     box = beside_a_resonance(0)
     found = GrayBoxRestructurer(RESONANCE).fit_model(box)

@@ -26,7 +26,7 @@ def test_feedthrough_that_the_structure_lacks_is_reported():
     )
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["band", "scalar", "matrix"])
 def test_weighted_error_is_the_norm_of_the_weighted_difference(kind, rough):
     black_box, plain = far_fit(2)

@@ -98,6 +98,7 @@ def test_the_fit_tells_that_the_model_is_the_controllers(options, digits):
     assert sum("closed loop" in t for t in texts) == 0
 
 
+@pytest.mark.slow
 def test_parts_that_a_disturbance_moves_are_said_to_tell_little():
     rng, n = np.random.default_rng(0), 1500
     u, y, x = np.zeros(n), np.zeros(n), 0.0

@@ -257,7 +257,7 @@ def test_short_records_in_motion_are_not_held_where_some_stand_by_chance(seed):
     assert not model.fit(X, np.vstack(outputs)).steady_start_
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "width, pause, level", [(1, 0, 0.0), (1, 2, 5.0), (4, 0, 5.0), (4, 2, 0.0)]
 )

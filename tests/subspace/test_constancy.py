@@ -39,7 +39,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["auto", "po-moesp"])
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_system_that_changes_is_told(change, method):

@@ -118,6 +118,7 @@ def test_prediction_begins_with_the_inputs_in_transit():
     )
 
 
+@pytest.mark.slow
 def test_residuals_tell_of_a_delay_that_is_missing():
     _, u, y = late_record(600, noise=0.05)
     tests = estimator().fit(u, y).residual_tests(u, y, n_lags=10)
@@ -372,6 +373,7 @@ def test_a_dead_time_of_more_than_a_tenth_of_a_record_is_found(seed):
     assert found.input_delay_.tolist() == [8]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_few_samples_of_a_system_leak_no_numerical_warnings():
     for seed in range(12):
@@ -398,7 +400,7 @@ def test_first_answers_need_evidence_for_each_input():
 # -- refused ---------------------------------------------------------------------
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "start"), [("auto", "estimate"), (2, "rest")])
 def test_a_delay_that_nobody_asked_for_is_told(order, start):
     rng = np.random.default_rng(0)

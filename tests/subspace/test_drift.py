@@ -208,7 +208,7 @@ class TestOutputsThatDoNotDrift:
         assert not _of_differences(model)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 11])
 def test_noise_that_shakes_slow_modes_may_be_more_than_drift(seed):
     rng = np.random.default_rng(seed)

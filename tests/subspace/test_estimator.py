@@ -140,7 +140,7 @@ def test_single_output_predicts_one_dimension(rng):
     assert SubspaceLTI(1).fit(u, y).predict(u).shape == (200, 1)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [15, 30])
 def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(horizon):
     scores = []

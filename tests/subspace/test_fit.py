@@ -435,7 +435,7 @@ def test_a_sensor_that_hangs_is_told():
     SubspaceLTI(1, missing="estimate").fit(u, y)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("fallen, length", [(0.0, 3), (-999.0, 1)])
 def test_a_sensor_that_drops_out_is_told(fallen, length):
     rng = np.random.default_rng(0)
@@ -617,6 +617,7 @@ def test_experiments_that_contradict_one_another_are_told(gains):
     assert n_told >= 8 if gains[0] != gains[1] else n_told == 0
 
 
+@pytest.mark.slow
 def test_experiments_of_another_system_are_named():
     """Of two the outputs were exchanged; where none were, as noisy, all is silent."""
     system = StateSpace([[0.6, 0.5], [-0.5, 0.6]], [[1], [0]], [[1, 0]], None, 1.0)

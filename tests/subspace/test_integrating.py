@@ -261,6 +261,7 @@ def test_rates_that_are_mostly_noise_explain_their_sums():
         SubspaceLTI(1, sampling_time=STEP, integrating=True).fit(u, noise)
 
 
+@pytest.mark.slow
 def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
     """A battery, whose resistance makes one value at every step of a current."""
     rng = np.random.default_rng(1)
@@ -273,7 +274,7 @@ def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
     assert not any("drops out" in str(one.message) for one in caught)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The inputs know the noise")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_controller_that_answers_at_once_is_no_feedthrough_of_the_others(seed):

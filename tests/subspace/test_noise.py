@@ -224,6 +224,7 @@ def test_a_poor_sensor_does_not_spoil_a_good_one():
     assert weighted[0] < 0.1 * plain[0] and weighted[1] < 1.1 * plain[1]
 
 
+@pytest.mark.slow
 def test_coloured_noise_costs_less_than_plain_errors_would_make_it():
     """White noise changes nothing."""
     pairs = [experiment([0.5, 0.5], seed, pole=0.95) for seed in range(4)]

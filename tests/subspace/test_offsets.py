@@ -126,6 +126,7 @@ def test_the_resting_point_may_be_where_drifts_begin(rng):
     np.testing.assert_allclose(middle - begun, 4.0 * np.array([1.0, -2.0]))
 
 
+@pytest.mark.slow
 def test_a_drift_that_a_simulation_misses_is_told(rng):
     u = np.repeat(rng.choice([-1.0, 1.0], 50), 10)[:, None]
     plant = StateSpace([[0.8]], [[0.2]], [[1.0]], sampling_time=1.0)
@@ -139,7 +140,7 @@ def test_a_drift_that_a_simulation_misses_is_told(rng):
     )
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Output . drifts along a line")
 @pytest.mark.parametrize("size", [0.1, 1.0])
 def test_a_given_order_does_not_hide_a_drift(rng, size):
@@ -339,7 +340,7 @@ def test_constants_of_the_size_of_the_noise_are_found(pole):
     assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "offset"), [(0, "constant"), (2, "linear")])
 def test_constants_are_seen_through_noise_of_long_memory(seed, offset):
     """Of another output, too: they are many times what that noise moves."""
@@ -595,7 +596,7 @@ def test_a_step_test_about_a_level_has_a_constant(seed):
     assert fit_of(model, inputs, fresh + level) > 0.9
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_level_of_an_integrators_input_is_no_second_integrator(seed):
     """Beside a pole next to one its constant is far beyond all outputs."""
@@ -713,7 +714,7 @@ def test_constants_of_what_stays_far_from_zero_are_taken_in_slow_noise(level):
     np.testing.assert_allclose(np.mean(gains), 2.0, atol=0.2)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_drift_does_not_hide_constants_far_from_zero(seed):
     rng = np.random.default_rng(seed)
@@ -745,6 +746,7 @@ def test_prediction_warns_where_constants_differ(rng):
         assert same.score(X, y) > 0.97
 
 
+@pytest.mark.slow
 def test_residual_tests_allow_for_constants():
     passed = []
     for seed in range(4):
@@ -893,6 +895,7 @@ def test_a_step_from_rest_tells_that_there_is_no_constant():
         assert model.score(u, y) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of the integrator
 def test_a_constant_and_an_integrator_do_not_stand_for_a_drift():
     """An offset of the input behind an integrator is a ramp of the output."""

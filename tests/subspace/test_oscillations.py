@@ -68,7 +68,7 @@ def test_the_plant_is_that_of_records_without_the_oscillation(size):
     assert _error(of_given) < 1.1 * _error(model) + 2e-4
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, seed", [("shifts", 0), ("shifts", 1), ("hum", 3)])
 def test_what_is_taken_out_is_no_delay(kind, seed):
     """Beside it inputs seemed to arrive late."""
@@ -186,7 +186,7 @@ def test_long_records_keep_the_heads_of_it():
     assert ahead.std() < 0.022 * y.std()
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["auto", 2])
 def test_ring_downs_are_the_plants(order):
     """Many short ones, in which a weak input hardly moves the mode."""
@@ -202,7 +202,7 @@ def test_ring_downs_are_the_plants(order):
     assert _error(model, plant) < 0.2
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("lines, seed", [((5, 60), 0), ((5, 60), 1), ((3, 7, 31), 0)])
 def test_modes_of_few_lines_give_way_to_those_that_decay(lines, seed):
     """A plant with play at its output, moved at a few frequencies, on other phases."""

@@ -66,6 +66,7 @@ def test_the_error_falls_under_feedback_where_that_of_others_stays():
     assert errors["pbsid"][1] < 0.03 and errors["pbsid"][0] < 0.1
 
 
+@pytest.mark.slow
 def test_a_plant_may_be_unstable():
     u, y = unstable_loop(0)
     with pytest.warns(UserWarning, match="predicted .* controller's reference"):
@@ -388,7 +389,7 @@ def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop()
         assert error < of_that
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("lead", [3, 6])
 def test_outputs_that_lead_the_inputs_are_told(lead):
     rng = np.random.default_rng(lead)
@@ -477,7 +478,7 @@ def test_auto_keeps_a_plant_that_only_the_loop_holds():
         assert_allclose(np.abs(model.lti_.poles()).max(), 1.1, atol=0.03)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
     """Steps of a reference through a PD controller of a magnet that falls by itself."""
@@ -523,6 +524,7 @@ def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it():
     assert np.abs(model.lti_.poles()).max() == pytest.approx(poles.max(), abs=3e-3)
 
 
+@pytest.mark.slow
 def test_a_spring_that_hardens_is_no_plant_that_a_controller_holds():
     """Many states predict it well in open loop, and some of these grow."""
     u, y = sweep_of_a_hardening_spring(600, damping=0.02, cubic=4.0, rates=(1.2, 0.6))
@@ -569,7 +571,7 @@ def shaken(seed, shared, n_samples=3000, size=1.0):
     return (u, y + 0.01 * y.std() * rng.standard_normal(y.shape)), plant
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
     samples, plant = shaken(seed, shared=True)
@@ -669,7 +671,7 @@ def early_outputs(seed, n_samples=300):
 
 
 @pytest.mark.filterwarnings("ignore:The identified model is unstable")
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_split_must_be_as_likely_as_the_whole(seed):
     """Wald's statistic calls modes noise whose loss spoils a model that is wrong."""
@@ -753,7 +755,7 @@ def car_with_biases(seed, speed=32.0, n_samples=4000, step=0.01):
     return u + 0.01, y + [0.004, 0.15]
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("speed, seed", [(20.0, 1), (26.0, 6)])
 def test_constants_beside_a_given_order_are_no_less_likely_than_none(speed, seed):
     """The model with constants begins at the one without: levels were lost else."""

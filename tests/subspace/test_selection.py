@@ -46,6 +46,7 @@ def coloured(seed, n_samples, pole=0.9, level=0.3):
     return Record.of(u, y + level * y.std(axis=0) * e / e.std(axis=0))
 
 
+@pytest.mark.slow
 def test_coloured_noise_is_not_taken_for_states():
     orders = [
         select([coloured(seed, 600)], None, None, Settings(freedom(2, 1))).order
@@ -154,6 +155,7 @@ def test_resonances_that_noise_could_be_do_not_end_the_search(seed):
     assert bft_score(plant.simulate(fresh), model.lti_.simulate(fresh)) > 99.0
 
 
+@pytest.mark.slow
 def test_the_highest_order_that_is_tried_is_told(monkeypatch):
     monkeypatch.setattr(selection, "MAX_ORDER", 4)
     monkeypatch.setattr(fit_warnings, "MAX_ORDER", 4)
@@ -204,6 +206,7 @@ def test_orders_out_of_the_question_are_not_simulated_on_parts_held_out(rng):
         assert chosen.order == 2 and known[2] and known[[0, 1]].tolist() == lower
 
 
+@pytest.mark.slow
 def test_the_noise_of_the_choice_goes_with_it():
     chosen = select([coloured(2, 2000)], None, None, Settings(freedom(2, 1)))
     np.testing.assert_allclose(chosen.candidate.whitening.filter[1], -0.9, atol=0.05)
@@ -288,7 +291,7 @@ def test_many_short_experiments_tell_the_order():
     assert np.linalg.norm(error) < 0.03 * np.linalg.norm(exact)
 
 
-@pytest.mark.broad
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_outputs_behind_a_filter_have_their_order(seed):
     """What such an output makes of its own past is likelier than any few states."""

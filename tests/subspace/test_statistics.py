@@ -120,6 +120,7 @@ def test_noise_model_in_the_units_of_the_outputs():
     )
 
 
+@pytest.mark.slow
 def test_noise_states_make_the_unrefined_po_moesp_consistent():
     errors = {}
     for extra in (0, 2):

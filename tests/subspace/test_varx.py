@@ -124,6 +124,7 @@ def test_an_input_beside_a_controller_does_not_hide_its_answers(kind):
         assert found.may_be_answered == (kind == "answer")
 
 
+@pytest.mark.slow
 def test_lines_within_the_sample_are_hardly_refuted_by_chance():
     p = []
     for rng in map(np.random.default_rng, range(60)):

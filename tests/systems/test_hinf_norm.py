@@ -398,6 +398,7 @@ def test_no_crossing_of_a_level_is_missed(discrete: bool, fraction: float) -> No
 # ----------------------------------------------------------------- stress
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 5))]
 )
