@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -16,6 +17,7 @@ from lpvlearn import (
     save,
 )
 from lpvlearn.pipeline.one_basis.between_samples import _meets_more
+from lpvlearn.pipeline.points.local_models import LocalModel, as_ramps
 
 DT = 0.05
 
@@ -31,14 +33,31 @@ def waves(rng, t):
     return np.cos(2 * np.pi * f * t[:, None] + rng.uniform(0, 6.3, 25)).sum(1)[:, None]
 
 
-def table(hold, structure=SPRING, theta=TRUE, *, noise=0.02, runs=1, n_samples=300):
+def filtered(rng, t):
+    """Noise through a filter at 0.15 of the Nyquist frequency."""
+    b, a = signal.butter(2, 0.15)
+    return 3 * signal.lfilter(b, a, rng.standard_normal(len(t) + 200))[200:, None]
+
+
+def table(
+    hold,
+    structure=SPRING,
+    theta=TRUE,
+    *,
+    noise=0.02,
+    runs=1,
+    n_samples=300,
+    delay=0,
+    inputs=waves,
+):
     """Three points, with inputs that are held, ramps, or smooth between samples."""
     rng, found = np.random.default_rng(0), []
     for kappa, row in zip((0.0, 0.5, 1.0), theta, strict=True):
         model, fine = structure.model(row), 1 if hold in ("zoh", "foh") else 20
-        u = waves(rng, np.arange(n_samples * fine) / fine)
+        u = inputs(rng, np.arange(n_samples * fine) / fine)
         sampled = model.to_discrete(DT / fine, hold if fine == 1 else "foh")
-        u, y = u[::fine], sampled.simulate(u)[::fine]
+        late = sampled.with_input_delay(delay * fine)
+        u, y = u[::fine], late.simulate(u)[::fine]
         for _ in range(runs):
             error = noise * y.std(0) * rng.standard_normal(y.shape)
             found.append((u, kappa, y + error))
@@ -72,6 +91,33 @@ def test_ramps_are_found_and_make_no_delay(tmp_path):
     again = load(tmp_path / "model.zip")
     assert again.lpv_.hold == "foh"
     np.testing.assert_array_equal(again.predict(X), model.predict(X))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [1, 3])
+def test_ramps_after_a_delay_are_found(delay):
+    """Held inputs that are as late have their first answer a sample later."""
+    X, y = table("foh", delay=delay, inputs=filtered, n_samples=500)
+    local = SubspaceLTI(input_delay="auto")
+    model = pipeline(local=local).fit(X, y)
+    assert model.lpv_.hold == "foh" and off(model) < 0.01
+    np.testing.assert_array_equal(model.input_delay_, [delay])
+
+
+def test_ramps_end_a_delay_that_held_inputs_seem_to_have():
+    """Sampled, both models are the same: of inputs with delays and without."""
+    model = StateSpace(
+        -np.eye(2), np.eye(2), [[1.0, 2.0], [3.0, 1.0]], [[0, 1], [0, 0]]
+    )
+    held = LocalModel(model.with_input_delay([2 * DT, 0.0]), 2, None)
+    found = as_ramps(held, [], DT).lti
+    np.testing.assert_allclose(found.input_delay, [3 * DT, 0.0])
+    omega = np.linspace(0.1, 3.0, 20) / DT
+    np.testing.assert_allclose(
+        found.to_discrete(DT, "foh").frequency_response(omega),
+        held.lti.to_discrete(DT).frequency_response(omega),
+        rtol=1e-10,
+    )
 
 
 @pytest.mark.slow

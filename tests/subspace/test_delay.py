@@ -448,3 +448,22 @@ def test_a_stream_cannot_look_for_its_delay():
     _, u, y = late_record()
     with pytest.raises(ValueError, match="`input_delay` must be a number in partial"):
         estimator(input_delay="auto").partial_fit(u, y)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The response is hardly known")
+@pytest.mark.parametrize(("seed", "delay"), [(2, 0), (3, 0), (0, 1), (1, 4)])
+def test_inputs_that_are_foretold_make_no_delay(seed, delay):
+    """Early ones tell the later ones: any delay is possible with states enough."""
+    rng, t = np.random.default_rng(seed), np.arange(300)[:, None]
+    f = np.linspace(0.02, 1 / 12, 25)
+    u = np.cos(2 * np.pi * f * t + rng.uniform(0, 6.3, 25)).sum(axis=1, keepdims=True)
+    spring = StateSpace([[0, 1], [-50, -1.5]], [[0], [3]], [[1, 0]]).to_discrete(0.05)
+    model = spring.with_input_delay(delay)
+    y = model.simulate(u)
+    y += 0.02 * y.std() * rng.standard_normal(y.shape)
+    found = SubspaceLTI(input_delay="auto", sampling_time=0.05).fit(u, y)
+    assert found.input_delay_[0] <= delay and found.order_ <= 2 + delay
+    omega = 2 * np.pi * f / 0.05
+    G, G0 = (m.frequency_response(omega) for m in (found.lti_, model))
+    assert np.linalg.norm(G - G0) < 0.01 * np.linalg.norm(G0)

@@ -97,8 +97,14 @@ def restructured_by_hold(
 
 
 def _may_be_ramps(found: StructuredModels) -> bool:
-    """Whether inputs are smooth, and models do at once a part of what ramps do."""
-    direct = any(model.lti.D.any() or model.integrating for model in found.local)
+    """Whether inputs are smooth, and models do at once a part of what ramps do.
+
+    Or after a delay, which may be a sample longer.
+    """
+    direct = any(
+        model.lti.D.any() or model.lti.input_delay.any() or model.integrating
+        for model in found.local
+    )
     groups = found.points.experiments
     return direct and are_smooth([e.inputs for group in groups for e in group])
 

@@ -250,14 +250,17 @@ def as_ramps(
 
     Raises a ValueError where it has no equivalent.
     """
-    estimates: list[Estimate] = [
-        (estimate.to_continuous("foh"), _all_continuous(list(pairs), "foh"))
-        for estimate, pairs in model.estimates
-    ]
+    estimates: list[Estimate] = []
+    for held, pairs in model.estimates:
+        either = [(_answering(one), _answering(other)) for one, other in pairs]
+        continuous = _answering(held).to_continuous("foh")
+        estimates.append((continuous, _all_continuous(either, "foh")))
     models = [estimate for estimate, _ in estimates]
     if not models:  # the uncertainty is not known
-        held = model.realizations or [model.lti]
-        models = [m.to_discrete(sampling_time).to_continuous("foh") for m in held]
+        sampled = [
+            m.to_discrete(sampling_time) for m in model.realizations or [model.lti]
+        ]
+        models = [_answering(m).to_continuous("foh") for m in sampled]
     if len(models) > 1:
         models = _in_one_basis(models, experiments)
         lti = _average(models)
@@ -267,6 +270,24 @@ def as_ramps(
     return replace(
         model, lti=lti, realizations=models, estimates=estimates, discretization="foh"
     )
+
+
+def _answering(model: StateSpace) -> StateSpace:
+    """The same model, whose inputs are answered at once after their delays.
+
+    As ramps are: a delay ends a sample later than one of held inputs. With
+    ``q (q I - A)^-1 = I + (q I - A)^-1 A`` it has ``A b``, and ``C b`` for d, of them.
+    """
+    late = (model.input_delay > 0) & ~model.D.any(axis=0)
+    if not late.any():
+        return model
+    B, D = (
+        np.where(late, model.A @ model.B, model.B),
+        model.D + late * (model.C @ model.B),
+    )
+    names = model.input_names, model.output_names, model.units
+    delay = model.input_delay + late
+    return StateSpace(model.A, B, model.C, D, model.sampling_time, delay, *names)
 
 
 def _told_by(fitted: Any, experiments: Sequence[Experiment]) -> dict[str, Any]:

@@ -73,6 +73,8 @@ _WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
 
 _STATES = range(-2, 3)  # about the order chosen at the longest delay, that are tried
 
+_SMOOTH = 0.5  # steps of smooth inputs from sample to sample, relative to their size
+
 _GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
 
 # Long delays that smooth inputs leave possible are looked at in so many steps first,
@@ -198,6 +200,10 @@ def find_delays(
     orders = [] if order is None else [order]
     if order is None or horizon is None:
         chosen = select(trial.records(delay), order, horizon, settings)
+        if are_foretold(pairs, delay > 0):
+            undelayed = trial.records(np.zeros_like(delay))
+            other = select(undelayed, order, horizon, settings)
+            chosen = min(chosen, other, key=lambda selected: selected.order)
         trial = replace(trial, horizon=chosen.horizon)
         about = [chosen.order + more for more in _STATES if chosen.order + more >= 0]
         orders = orders or about
@@ -205,6 +211,16 @@ def find_delays(
     for j in np.flatnonzero(delay):
         delay[j] = trial.delay_of(int(j), delay, orders, given=order is not None)
     return delay
+
+
+def are_foretold(pairs: Pairs, of: NDArray[np.bool_]) -> bool:
+    """Whether some of the inputs are smooth, so that early ones tell the later ones.
+
+    The longest delay may be much too long then, and states stand for what it lacks.
+    """
+    steps = np.sum([(np.diff(u, axis=0) ** 2).sum(axis=0) for u, _ in pairs], axis=0)
+    sizes = np.sum([(u**2).sum(axis=0) for u, _ in pairs], axis=0)
+    return bool((steps < _SMOOTH**2 * sizes)[of].any())
 
 
 def longest_delays(pairs: Pairs, direct: NDArray[np.bool_]) -> Delay:
