@@ -290,7 +290,8 @@ class SubspaceLTI(ScoredFromRest):
     begun_state_ : ndarray of shape (order,) or None
         State in which the experiments begin, their mean, where a mode does not decay
         over them and rest is farther from their outputs than these range: `predict`
-        begins there. None, as nearly always, for rest; and of batches.
+        begins there. Outputs that integrate (`integrating`), which rest anywhere, begin
+        there wherever that is. None, as nearly always, for rest; and of batches.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero unless `offset_` is "linear", and where an offset of the

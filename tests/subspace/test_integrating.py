@@ -293,3 +293,30 @@ def test_a_controller_that_answers_at_once_is_no_feedthrough_of_the_others(seed)
     gain = local.lti_.to_continuous().frequency_response([3.0])[0]
     true = plant.to_continuous().frequency_response([3.0])[0]
     assert np.linalg.norm(gain - true) < 0.05 * np.linalg.norm(true)
+
+
+@pytest.mark.broad
+@pytest.mark.parametrize("runs", [1, 3])
+def test_outputs_that_integrate_begin_where_those_of_the_fit_did(runs):
+    """A ship's heading: no motion tells its zero."""
+    rng = np.random.default_rng(0)
+    ship = StateSpace([[0, 1], [0, -0.05]], [[0], [0.002]], [[1, 0]]).to_discrete(1.0)
+    tables, outputs = [], []
+    for run in range(runs):
+        u = 6 * rng.choice([-1.0, 1.0], size=20).repeat(30)
+        y = 90 + ship.simulate(u)[:, 0]
+        tables.append(pd.DataFrame({"rudder": u, "run": run}))
+        outputs.append(y + 0.02 * rng.standard_normal(len(y)))
+    X, y = pd.concat(tables, ignore_index=True), np.concatenate(outputs)[:, None]
+    heading = SubspaceLTI(
+        inputs=["rudder"], experiment="run", sampling_time=1.0, integrating=[0]
+    ).fit(X, y)
+    u = 6 * rng.choice([-1.0, 1.0], size=20).repeat(30)
+    fresh = pd.DataFrame({"rudder": u, "run": 0})
+    error = heading.predict(fresh).ravel() - 90 - ship.simulate(u)[:, 0]
+    assert np.abs(error).max() < 0.03 * np.ptp(ship.simulate(u))
+    rates = heading.lti_.A @ heading.begun_state_ - heading.begun_state_
+    np.testing.assert_allclose(rates, 0.0, atol=1e-9)
+    # what is about zero to the errors begins there
+    about_zero = heading.fit(X, y - 90)
+    assert about_zero.begun_state_ is None

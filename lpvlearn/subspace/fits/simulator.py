@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from ...data.experiments import Experiment, are_beginnings
 from ...exceptions import DivergenceError
@@ -113,11 +114,14 @@ class Simulator(NamedTuple):
 
         A mode that does not decay rests nearly anywhere, and may stand for a part of
         the level, together with others: simulations from rest are off by that. None
-        where these begin no farther from all outputs than those are wide.
+        where these begin no farther from all outputs than those are wide; where outputs
+        are known to integrate, no farther than the errors are.
         """
         longest = max(len(e.inputs) for e in experiments)
         if not self.evidence.free.initial_states:
             return None
+        if isinstance(self.evidence, RateEvidence):
+            return self._place(experiments, self.evidence.flags)
         if not lasting(self.lti.poles(), longest).any():
             return None
         (u0, y0), outputs = self.resting_point(), [e.measured for e in experiments]
@@ -135,6 +139,30 @@ class Simulator(NamedTuple):
         if not np.isfinite(state).all() or far_off(y0 + self.lti.C @ state, outputs):
             return None
         return state
+
+    def _place(
+        self, experiments: Sequence[Experiment], flags: NDArray[np.bool_]
+    ) -> Array | None:
+        """State at rest where outputs that integrate begin, in the mean.
+
+        None where that is less than the errors.
+        """
+        lti, (u0, _) = self.lti, self.resting_point()
+        begun, errors = [], []
+        for e in compress(experiments, are_beginnings(experiments)):
+            try:
+                x0, level = self.own_part(e, of_fit=True)
+                own = lti.simulate(e.inputs - u0, initial_state=x0)
+            except (np.linalg.LinAlgError, DivergenceError):
+                return None
+            begun.append(lti.C @ x0)
+            errors.append(e.measured - level - own)
+        size = np.sqrt(np.nanmean(np.vstack(errors) ** 2, axis=0))
+        place = np.where(flags, np.mean(begun, axis=0), 0.0)
+        if not (np.isfinite(place).all() and (np.abs(place) > size).any()):
+            return None
+        still = null_space(lti.A - np.eye(lti.order))
+        return np.asarray(still @ np.linalg.lstsq(lti.C @ still, place, rcond=None)[0])
 
     def simulated(self, experiment: Experiment) -> Array:
         """Outputs from the beginning that the experiments of the fit let expect."""
