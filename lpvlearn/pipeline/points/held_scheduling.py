@@ -118,7 +118,7 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
         return None
     rest = SplineLPV(extrapolation="ignore").fit(points.kappa, outputs / sizes[1])
     bends = [_about_mean(rest.predict(run.kappa)) for run in runs]
-    if not (_most(bends) > _SLIGHT).any():
+    if not (_farthest(bends) > _SLIGHT).any():
         return None
     travelled = _square([_about_mean(run.kappa) for run in runs])
     steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
@@ -143,7 +143,7 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
     return replace(points, experiments=groups)
 
 
-def _most(bends: Sequence[Array]) -> Array:
+def _farthest(bends: Sequence[Array]) -> Array:
     """What outputs may move at most within a run, with all that slopes may add."""
     size = np.max([bend.std(axis=0) for bend in bends], axis=0)
     return size + _ADDED * np.sqrt(_square(bends) / min(map(len, bends)))

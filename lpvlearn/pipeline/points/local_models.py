@@ -257,10 +257,9 @@ def as_ramps(
         estimates.append((continuous, _all_continuous(either, "foh")))
     models = [estimate for estimate, _ in estimates]
     if not models:  # the uncertainty is not known
-        sampled = [
-            m.to_discrete(sampling_time) for m in model.realizations or [model.lti]
-        ]
-        models = [_answering(m).to_continuous("foh") for m in sampled]
+        known = model.realizations or [model.lti]
+        sampled = [_answering(m.to_discrete(sampling_time)) for m in known]
+        models = [m.to_continuous("foh") for m in sampled]
     if len(models) > 1:
         models = _in_one_basis(models, experiments)
         lti = _average(models)
@@ -281,10 +280,8 @@ def _answering(model: StateSpace) -> StateSpace:
     late = (model.input_delay > 0) & ~model.D.any(axis=0)
     if not late.any():
         return model
-    B, D = (
-        np.where(late, model.A @ model.B, model.B),
-        model.D + late * (model.C @ model.B),
-    )
+    B = np.where(late, model.A @ model.B, model.B)
+    D = model.D + late * (model.C @ model.B)
     names = model.input_names, model.output_names, model.units
     delay = model.input_delay + late
     return StateSpace(model.A, B, model.C, D, model.sampling_time, delay, *names)

@@ -200,7 +200,7 @@ def find_delays(
     orders = [] if order is None else [order]
     if order is None or horizon is None:
         chosen = select(trial.records(delay), order, horizon, settings)
-        if are_foretold(pairs, delay > 0):
+        if order is None and are_foretold(pairs, delay > 0):
             undelayed = trial.records(np.zeros_like(delay))
             other = select(undelayed, order, horizon, settings)
             chosen = min(chosen, other, key=lambda selected: selected.order)

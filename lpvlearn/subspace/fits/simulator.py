@@ -117,11 +117,11 @@ class Simulator(NamedTuple):
         where these begin no farther from all outputs than those are wide; where outputs
         are known to integrate, no farther than the errors are.
         """
-        longest = max(len(e.inputs) for e in experiments)
         if not self.evidence.free.initial_states:
             return None
         if isinstance(self.evidence, RateEvidence):
             return self._place(experiments, self.evidence.flags)
+        longest = max(len(e.inputs) for e in experiments)
         if not lasting(self.lti.poles(), longest).any():
             return None
         (u0, y0), outputs = self.resting_point(), [e.measured for e in experiments]
@@ -147,16 +147,15 @@ class Simulator(NamedTuple):
 
         None where that is less than the errors.
         """
-        lti, (u0, _) = self.lti, self.resting_point()
-        begun, errors = [], []
+        lti, begun, errors = self.lti, [], []
         for e in compress(experiments, are_beginnings(experiments)):
             try:
                 x0, level = self.own_part(e, of_fit=True)
-                own = lti.simulate(e.inputs - u0, initial_state=x0)
+                simulated = level + self._answers(x0, e)
             except (np.linalg.LinAlgError, DivergenceError):
                 return None
             begun.append(lti.C @ x0)
-            errors.append(e.measured - level - own)
+            errors.append(e.measured - simulated)
         size = np.sqrt(np.nanmean(np.vstack(errors) ** 2, axis=0))
         place = np.where(flags, np.mean(begun, axis=0), 0.0)
         if not (np.isfinite(place).all() and (np.abs(place) > size).any()):
@@ -171,8 +170,7 @@ class Simulator(NamedTuple):
     def from_own_beginning(self, experiment: Experiment) -> Array:
         """Outputs from the initial state, and about the level, of its measured ones."""
         x0, level = self.own_part(experiment)
-        u0, _ = self.resting_point()
-        return level + self.lti.simulate(experiment.inputs - u0, initial_state=x0)
+        return level + self._answers(x0, experiment)
 
     def beginning(self, experiment: Experiment) -> Array | None:
         """State and inputs in transit where the first inputs hold it; None for rest."""
@@ -215,8 +213,12 @@ class Simulator(NamedTuple):
 
     def _from(self, x0: Array | None, experiment: Experiment) -> Array:
         """Outputs about the mean offsets from a state there; None is rest."""
-        u0, y0 = self.resting_point()
-        return y0 + self.lti.simulate(experiment.inputs - u0, initial_state=x0)
+        return self.resting_point()[1] + self._answers(x0, experiment)
+
+    def _answers(self, x0: Array | None, experiment: Experiment) -> Array:
+        """What the model answers from a state to inputs, about those at rest."""
+        u0, _ = self.resting_point()
+        return self.lti.simulate(experiment.inputs - u0, initial_state=x0)
 
     def _unexplained(self, experiment: Experiment, trend: Array) -> tuple[Array, Array]:
         """Responses to own unknowns, and the errors of simulation they are to explain.
