@@ -235,6 +235,28 @@ def test_more_data_shrink_the_standard_deviation_as_one_over_root_n():
     assert stds[0] / stds[1] == pytest.approx(np.sqrt(40.0), rel=0.1)
 
 
+def heading(seed):
+    """A ship's: an integrator behind a lag, about a level, with a biased rudder."""
+    rng = np.random.default_rng(seed)
+    u = 10.0 * np.repeat(rng.choice([-1.0, 1.0], 30), 20) + rng.normal(0.0, 2.0, 600)
+    rate = lfilter([0.0, 0.4], [1.0, -0.94], u - u.mean())
+    y = 90.0 + lfilter([0.0, 1.0], [1.0, -1.0], rate)
+    return u[:, None] + 1.0, (y + 0.005 * y.std() * rng.standard_normal(600))[:, None]
+
+
+def test_poles_beside_an_integrator_are_known_as_well_as_they_are_found():
+    """Near 1 a pole's free response is all but the constant: of that nothing hangs."""
+    models = [SubspaceLTI(2).fit(*heading(seed)) for seed in range(5)]
+    lags, integrators = np.array([model.lti_.poles().real for model in models]).T
+    stds = np.array([model.poles_std_.real for model in models])
+    # Some models stand at the edge of stability, others at a distance.
+    assert (1.0 - integrators).min() < 2e-8 and (1.0 - integrators).max() > 1e-6
+    assert (stds / np.median(stds, axis=0) < 3.0).all()
+    assert (stds / np.median(stds, axis=0) > 1.0 / 3.0).all()
+    hits = np.abs(np.array([lags - 0.94, integrators - 1.0]).T / stds)
+    assert hits.max() < 3.0 and np.mean(hits[:, 0] ** 2) < 2.5
+
+
 def test_covariance_of_an_unrefined_model_is_refused():
     model = SubspaceLTI(2, horizon=10, refine=False).fit(*experiment(0, 400))
     with pytest.raises(ValueError, match="refine='simulation' or 'prediction'"):

@@ -198,11 +198,12 @@ def _warn_of_error(
                 "wind and roads do"
             )
         free, records = fitted.evidence.free, fitted.scaled.records
-        n_samples = [record.n_samples for record in records]
+        n_samples = [record.n_samples for record in records]  # of a stream none
         # Glitches hide whatever else there is.
         if bent or _tells_of_glitches(fitted, telling):
             return
-        if fitted.method != "pbsid" and Settings(free).max_horizon(n_samples) < 2:
+        subspace = bool(n_samples) and fitted.method != "pbsid"
+        if subspace and Settings(free).max_horizon(n_samples) < 2:
             telling.once(
                 "useless",
                 f"{_next_to_nothing(fitted)} So few samples ({max(n_samples)}) carry "

@@ -63,6 +63,8 @@ Array = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-12  # relative variance below which a direction is rounding
 
+_APART = 1e-2  # of the inverse of a record's length, between a pole and 1
+
 _RCOND = 1e-15  # the weakest direction of the information that is told from rounding
 
 
@@ -410,6 +412,7 @@ def parameter_covariance(
     Of a model in section form, at the minimum of the simulation error on the records.
     Along changes of the state basis, which the data do not determine, it is zero.
     """
+    model = _apart_from_one(model, records, free)
     assert model.blocks is not None
     information: Array | float = 0.0
     score: Array | float = 0.0
@@ -433,6 +436,27 @@ def parameter_covariance(
     n_values = sum(record.n_values for record in records)
     n_free = int(kept.sum()) + len(records) * own
     return inverse @ S @ inverse * (n_values / max(n_values - n_free, 1))
+
+
+def _apart_from_one(
+    model: Realization, records: Sequence[Record], free: Freedom
+) -> Realization:
+    """The model, with poles that are 1 to the records a little away from there.
+
+    Beside a constant the free response of such a pole tells a ramp only, by a
+    difference of both: the nearer, the larger they are, until nothing but rounding is
+    left of what tells the pole. What its covariance is hardly depends on where it is.
+    """
+    assert model.blocks is not None
+    least = _APART / max(record.n_samples for record in records)
+    near = [bool((abs(np.linalg.eigvals(b) - 1.0) < least).any()) for b in model.blocks]
+    if not (free.n_trend and any(near)):
+        return model
+    A = model.A.copy()
+    for part, is_near in zip(block_slices(model.blocks), near, strict=True):
+        A[part, part] -= 2.0 * least * is_near * np.eye(part.stop - part.start)
+    blocks = tuple(A[part, part] for part in block_slices(model.blocks))
+    return with_initial_states(model._replace(A=A, blocks=blocks), records, free)
 
 
 def _experiment_terms(

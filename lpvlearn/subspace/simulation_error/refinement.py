@@ -44,6 +44,7 @@ _MISS_WEIGHT, _LEAST_LEFT = 4.0, 2.5e-3
 
 ROUNDING = 1e-22  # share of the outputs' energy below which the error is rounding
 _STABLE_RADIUS = 1.0 - 1e-8  # of the circle that steps keep all poles in, once they are
+_EDGE = _STABLE_RADIUS - 1e-12  # beyond: on that circle, but for rounding
 
 # Damping of the steps tried in turn, relative to the largest squared singular value:
 # the whole step, then from the hardly determined directions to ever more of them, at
@@ -116,7 +117,8 @@ def refine_simulation(
         miss = predicted - gain
         model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
-        if left <= negligible:
+        at_edge = block_radius(model.blocks or ()) > _EDGE  # which bounds the gain
+        if left <= negligible or (at_edge and gain <= negligible):
             return model
     return model
 
@@ -137,15 +139,26 @@ def _accepted(
 ) -> tuple[_Trial, Realization] | None:
     """The first of ever shorter steps that reduces the error, and its model."""
     radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
+    lasting = radius + 1.0 / max(record.n_samples for record in records)
     for trial in trials:
         moved = moved_model(model, trial.step, free)
         blocks = moved.blocks or ()
-        if block_radius(blocks) > radius:
+        if not block_radius(blocks) <= lasting:
             continue
+        blocks = tuple(_within(block, radius) for block in blocks)
         found = block_fit(blocks, moved.C, records, free)
         if found.loss < model.loss:
             return trial, found
     return None
+
+
+def _within(block: Array, radius: float) -> Array:
+    """A block of A, its poles beyond a radius taken back to it: others may move on."""
+    if block_radius([block]) <= radius:
+        return block
+    poles, V = np.linalg.eig(block)
+    poles *= np.minimum(1.0, radius / np.abs(poles))
+    return np.asarray((V * poles @ np.linalg.pinv(V)).real)
 
 
 def _trial_steps(
