@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from joblib import Memory
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
 from lpvlearn.data.experiments import read_experiments
 from lpvlearn.data.operating_points import local_experiments
-from lpvlearn.pipeline.points.held_scheduling import _held, _slope
+from lpvlearn.pipeline.points.held_scheduling import _held, slopes_at_rest
+from lpvlearn.pipeline.running.runner import PointRunner
 
 ROLES = {"scheduling": "charge", "experiment": "run", "time": "t"}
+RUNNER = PointRunner(None, 0, "raise", Memory(None))
 LEVELS = (0.2, 0.4, 0.6, 0.8)
 CELL = GrayBoxStructure.from_template(A=[["-a"]], B=[["b"]], C=[[-1]], D=[["-r"]])
 
@@ -20,7 +23,21 @@ def at_rest(charge):
     return 3.2 + 0.9 * charge + 0.3 * charge**2
 
 
-def discharged(n_samples=600, noise=2e-4, moved=1e-4, measured="voltage", seed=0):
+def with_knee(charge):
+    """Of which four charges tell neither slope nor curvature."""
+    return 3.2 + 0.9 * charge + 0.15 * np.tanh(12.0 * (charge - 0.15))
+
+
+def discharged(
+    n_samples=600,
+    noise=2e-4,
+    moved=1e-4,
+    measured="voltage",
+    seed=0,
+    *,
+    rest=at_rest,
+    decay=0.05,
+):
     """A cell (tau 20 s) at four charges, which its current moves."""
     rng = np.random.default_rng(seed)
     tables = []
@@ -31,8 +48,8 @@ def discharged(n_samples=600, noise=2e-4, moved=1e-4, measured="voltage", seed=0
         state, states = 0.0, np.empty(n_samples)
         for k, i in enumerate(current):
             states[k] = state
-            state = np.exp(-0.05) * state + 0.02 * (1.0 - np.exp(-0.05)) * i
-        voltage = at_rest(charge) - states - 0.03 * current
+            state = np.exp(-decay) * state + 0.02 * (1.0 - np.exp(-decay)) * i
+        voltage = rest(charge) - states - 0.03 * current
         columns = {"t": np.arange(float(n_samples)), "run": run, "current": current}
         table = pd.DataFrame(columns | {"charge": charge, "voltage": voltage})
         table["voltage"] += noise * rng.standard_normal(n_samples)
@@ -60,13 +77,26 @@ def test_outputs_that_follow_the_scheduling_are_no_mode_of_the_plant():
     assert found.score(X, y) > 0.995
 
 
+@pytest.mark.slow
+def test_slopes_are_those_of_each_point_where_few_points_tell_no_curve():
+    """Also beside a mode that is slow."""
+    X, y = discharged(1200, 1e-3, 5e-5, rest=with_knee, decay=0.01)
+    restructurer = GrayBoxRestructurer(CELL)
+    with pytest.warns(UserWarning, match=r"\['charge'\], move within local"):
+        found = LocalLPVPipeline(restructurer=restructurer, **ROLES).fit(X, y)
+    np.testing.assert_allclose(found.parameters_["a"], 0.01, rtol=0.06)
+    np.testing.assert_allclose(found.parameters_["b"], 0.0002, rtol=0.06)
+    np.testing.assert_allclose(found.parameters_["r"], 0.03, rtol=0.01)
+
+
+@pytest.mark.slow
 def test_slope_is_exact_without_noise():
     X, y = discharged(noise=0.0, moved=1e-5)
     for group in points_of(X, y).experiments:
         (run,) = group
         charge = run.kappa.mean()
         curve = 0.9 + 2.0 * 0.3 * charge
-        slope, variance = _slope(group, [np.zeros_like(run.measured)])
+        slope, variance = slopes_at_rest(group)
         np.testing.assert_allclose(slope, curve, rtol=1e-3)
         assert variance < 1e-6
 
@@ -75,7 +105,7 @@ def test_held_experiments_lack_only_what_the_scheduling_moved():
     X, y = discharged()
     points = points_of(X, y)
     for before, after in zip(
-        points.experiments, _held(points).experiments, strict=True
+        points.experiments, _held(points, RUNNER).experiments, strict=True
     ):
         (run,), (held,) = before, after
         moved = at_rest(run.kappa) - at_rest(run.kappa).mean()
@@ -86,19 +116,19 @@ def test_held_experiments_lack_only_what_the_scheduling_moved():
 
 @pytest.mark.parametrize("options", [{"moved": 0.0}, {"measured": "charge"}])
 def test_what_does_not_move_or_schedules_itself_stays(options):
-    assert _held(points_of(*discharged(**options))) is None
+    assert _held(points_of(*discharged(**options)), RUNNER) is None
 
 
 def test_inputs_at_other_levels_stay():
     X, y = discharged()
     X["current"] += 10.0 * X["run"]
-    assert _held(points_of(X, y)) is None
+    assert _held(points_of(X, y), RUNNER) is None
 
 
 def test_noise_of_the_scheduling_stays():
     X, y = discharged(moved=0.0)
     X["charge"] += 0.01 * np.random.default_rng(0).standard_normal(len(X))
-    assert _held(points_of(X, y)) is None
+    assert _held(points_of(X, y), RUNNER) is None
 
 
 def test_every_output_is_held_by_itself():
@@ -106,7 +136,7 @@ def test_every_output_is_held_by_itself():
     other = X.assign(output=0.01 * X["current"] + rng.standard_normal(4)[X["run"]])
     both = y.assign(other=other["output"] + 1e-4 * rng.standard_normal(len(y)))
     (alone,), (beside,) = (
-        _held(points_of(X, some)).experiments[1] for some in (y, both)
+        _held(points_of(X, some), RUNNER).experiments[1] for some in (y, both)
     )
     np.testing.assert_allclose(beside.measured[:, 0], alone.measured[:, 0], atol=2e-4)
 
@@ -115,7 +145,7 @@ def test_slopes_that_noise_tells_give_way_to_what_the_points_tell():
     rng, (X, y) = np.random.default_rng(0), discharged()
     clean = X["charge"]
     X["charge"] = clean + 0.0015 * rng.standard_normal(len(X))
-    for run, group in enumerate(_held(points_of(X, y)).experiments):
+    for run, group in enumerate(_held(points_of(X, y), RUNNER).experiments):
         moved = at_rest(clean[X["run"] == run].to_numpy())
         left = group[0].measured[:, 0] - y["output"][X["run"] == run] + moved
         assert np.std(left) < 0.4 * np.std(moved)

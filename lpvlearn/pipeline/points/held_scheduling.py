@@ -10,9 +10,9 @@ place of one of the plant. What has moved with it, ``y0(kappa(t)) - y0(mean)``, 
 subtracted where the models of the points are likelier without.
 
 What outputs stand at over the points tells how ``y0`` bends, if inputs stand at one
-level everywhere. Its slope at a point the experiments there tell better: that of
-``A(q) y = B(q) u + A(1) dy0/dkappa kappa + c``, of many lags, by linear least squares;
-where the two disagree, what they tell is noise, or something else.
+level everywhere. Its slope at a point the experiments there tell better: it is the
+static gain from the scheduling variables, were they inputs. Where the two disagree, the
+points are too few to tell a curve, and a line with that slope is taken.
 
 Not where that follows an output itself: what schedules itself is no motion beside the
 plant's, but its own.
@@ -26,16 +26,17 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ...data.experiments import Experiment
+from ...data.experiments import Experiment, as_table
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, repeat, warn
 from ...lpv.equilibria import STANDING
 from ...lpv.spline import SplineLPV
+from ...subspace.estimator import SubspaceLTI
 from ...subspace.evidence.constants import CERTAIN
+from ...systems.modes import spectral_radius
 from ..running.runner import PointRunner
 from .local_models import LocalModel, channel_sizes, is_left, motions
 
@@ -43,13 +44,12 @@ Array = NDArray[np.float64]
 
 _Identified: TypeAlias = "tuple[list[LocalModel], OperatingPoints]"
 
-# Share of the outputs' motion that is worth it, and from which it may be the outputs'
-# own; steps from sample to sample, as a share of the outputs' and of its own size,
-# from which it is not slow; and what slopes may add to what the bends tell.
-_SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.5, 0.1, 0.5, 0.5
+# Share of the outputs' motion that is worth it, and what it leaves of one that is the
+# scheduling variable itself; steps from sample to sample, as a share of the outputs'
+# and of its own size, from which it is not slow; and what slopes may add to a curve
+# through the points that is one.
+_SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.2, 0.1, 0.5, 0.5
 
-_LAGS, _ROWS = 40, 4  # at most; and rows at least, for each parameter
-_RCOND = 1e-12  # of directions that the rows do not tell
 _MOST = 1_000_000  # samples, of tables that may lie on a disk
 
 
@@ -64,7 +64,7 @@ def identified_as_held(
     As if nothing had scheduled within these, where the models are likelier so. Then all
     of them have constants.
     """
-    still = _held(points)
+    still = _held(points, runner)
     if still is None:
         return identify(local, points, runner), points, local
     ways = [local]
@@ -102,7 +102,7 @@ def tell_of_held(names: Sequence[Hashable]) -> None:
     )
 
 
-def _held(points: OperatingPoints) -> OperatingPoints | None:
+def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | None:
     """The points without what their outputs do as scheduling variables move.
 
     None where that is nothing, or cannot be told.
@@ -120,27 +120,50 @@ def _held(points: OperatingPoints) -> OperatingPoints | None:
     bends = [_about_mean(rest.predict(run.kappa)) for run in runs]
     if not (_farthest(bends) > _SLIGHT).any():
         return None
-    travelled = _square([_about_mean(run.kappa) for run in runs])
-    steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
-    beyond, added = iter(bends), []
-    for group in points.experiments:
-        bent = [sizes[1] * next(beyond) for _ in group]
-        slope, variance = _slope(group, bent)
-        total = steep * sizes[1] ** 2 + variance  # of what it may be, and its error
-        slope *= 1.0 - variance / np.where(total > 0.0, total, 1.0)
-        slope /= sizes[1]
-        added += [_about_mean(run.kappa) @ slope for run in group]
-    agrees = _square(added) < _ADDED**2 * _square(bends)
-    changes = [
-        bend + np.where(agrees, more, 0.0)
-        for bend, more in zip(bends, added, strict=True)
-    ]
+    known = replace(runner, verbose=0).run(
+        "slopes at rest",
+        slopes_at_rest,
+        [(group,) for group in points.experiments],
+        points.kappa,
+    )
+    slopes = [done.result for done in known if done is not None]
+    changes = _changes(points, bends, slopes, sizes[1])
     moves = _moves(changes, [run.measured / sizes[1] for run in runs])
     if not moves.any():
         return None
     still = (np.where(moves, sizes[1] * change, 0.0) for change in changes)
     groups = [[_without(run, next(still)) for run in g] for g in points.experiments]
     return replace(points, experiments=groups)
+
+
+def _changes(
+    points: OperatingPoints,
+    bends: Sequence[Array],
+    slopes: Sequence[tuple[Array, Array]],
+    size: Array,
+) -> list[Array]:
+    """What outputs at rest do within every run, in units of their `size`.
+
+    By curves through the points, `bends`, and the slopes of each, which may be noise.
+    """
+    paths = [[_about_mean(run.kappa) for run in g] for g in points.experiments]
+    travelled = _square([path for some in paths for path in some])
+    steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
+    curves, lines, added = iter(bends), [], []
+    for some, (slope, variance) in zip(paths, slopes, strict=True):
+        own = np.vstack([next(curves) for _ in some])
+        bent = np.linalg.lstsq(np.vstack(some), own)[0]
+        variance = variance / size**2
+        total = steep + variance  # of what a slope may be beside, and its error
+        more = slope / size - bent
+        more *= np.divide(steep, total, out=np.zeros_like(total), where=total > 0.0)
+        lines += [path @ (bent + more) for path in some]
+        added += [path @ more for path in some]
+    agree = _square(added) < _ADDED**2 * _square(bends)
+    return [
+        np.where(agree, bend + more, line)
+        for bend, more, line in zip(bends, added, lines, strict=True)
+    ]
 
 
 def _farthest(bends: Sequence[Array]) -> Array:
@@ -150,15 +173,15 @@ def _farthest(bends: Sequence[Array]) -> Array:
 
 
 def _moves(changes: Sequence[Array], outputs: Sequence[Array]) -> NDArray[np.bool_]:
-    """Which outputs do slowly what matters; none where that is most that one does.
+    """Which outputs do slowly what matters; none where that is all that one does.
 
     In units of the outputs' motion. What is larger than that motion they do not do.
     """
     size = np.max([change.std(axis=0) for change in changes], axis=0)
     slow = _step(changes) < np.minimum(_FAST * _step(outputs), _NOISY * size)
     left = [y - change for y, change in zip(outputs, changes, strict=True)]
-    own = (size > _OWN) & (_about_means(left) < _about_means(outputs))
-    return (size > _SLIGHT) & (size < _OWN) & slow & ~own.any()
+    own = _about_means(left) < _OWN**2 * _about_means(outputs)
+    return (size > _SLIGHT) & (size < 1.0) & slow & ~own.any()
 
 
 def _without(run: Experiment, change: Array) -> Experiment:
@@ -167,51 +190,31 @@ def _without(run: Experiment, change: Array) -> Experiment:
     return replace(run, outputs=run.measured - change, scheduling=still)
 
 
-def _slope(group: Sequence[Experiment], bends: Sequence[Array]) -> tuple[Array, Array]:
+def slopes_at_rest(group: Sequence[Experiment]) -> tuple[Array, Array]:
     """Of outputs at rest over the scheduling variables, (n_scheduling, n_outputs).
 
-    At one point, beside what they bend; and its variance. Zero where there are too few
-    samples to tell.
+    And their variances, at one point; infinite where slopes are not told.
     """
-    n_scheduling, ny = group[0].kappa.shape[1], group[0].measured.shape[1]
-    per_lag = ny + group[0].inputs.shape[1]
-    lengths = [len(run.rows) for run in group]
-    lags = (sum(lengths) // _ROWS - n_scheduling) // per_lag
-    lags = min(_LAGS, lags, max(lengths) // _ROWS)
-    if lags < 1:
-        return np.zeros((n_scheduling, ny)), np.zeros((n_scheduling, ny))
-    causes, effects = [], []
-    for run, bend in zip(group, bends, strict=True):
-        if len(run.rows) <= lags + 1:
-            continue
-        u, y, kappa = run.inputs, run.measured - bend, _about_mean(run.kappa)
-        past = sliding_window_view(np.hstack([y[:-1], u[:-1]]), lags, axis=0)
-        past = past.reshape(len(past), -1)
-        rows = np.hstack([past, u[lags:], kappa[lags:]])
-        known = np.isfinite(rows).all(axis=1) & np.isfinite(y[lags:]).all(axis=1)
-        causes.append(_about_mean(rows[known]))
-        effects.append(_about_mean(y[lags:][known]))
-    H, Y = np.vstack(causes), np.vstack(effects)
-    size = np.linalg.norm(H, axis=0)
-    size[size == 0.0] = 1.0
-    # by the triangular factor of all, which has the products of all columns
-    factor = np.asarray(np.linalg.qr(np.hstack([H / size, Y]), mode="r"))
-    R, seen = np.split(factor, [len(size)], axis=1)
-    inverse = np.linalg.pinv(R, rcond=_RCOND) / size[:, None]
-    found = inverse @ seen
-    left = seen - (R * size) @ found
-    noise = left.T @ left / max(len(H) - len(size), 1)
-    # of all lags of every output, and of the scheduling variables
-    sums = np.zeros((ny + n_scheduling, H.shape[1]))
-    sums[:ny, : ny * lags] = np.kron(np.eye(ny), np.ones(lags))
-    sums[ny:, -n_scheduling:] = np.eye(n_scheduling)
-    of_past, of_kappa = np.split(sums @ found, [ny])
-    settled = np.linalg.pinv(np.eye(ny) - of_past)
-    slope = of_kappa @ settled
-    # d slope = (d of_kappa + slope d of_past) settled
-    moves = np.hstack([slope, np.eye(n_scheduling)]) @ sums @ inverse
-    spread = np.sum(moves**2, axis=1)[:, None] * np.diag(settled.T @ noise @ settled)
-    return slope, spread
+    kappa = [_about_mean(run.kappa) for run in group]
+    moves = np.asarray(np.vstack(kappa).any(axis=0))
+    slopes = np.zeros((len(moves), group[0].measured.shape[1]))
+    variances = np.full_like(slopes, np.inf)
+    driven = [
+        replace(run, inputs=np.hstack([run.inputs, path[:, moves]]), input_names=())
+        for run, path in zip(group, kappa, strict=True)
+    ]
+    table, y = as_table(driven)
+    *inputs, label = table.columns
+    roles = {"inputs": inputs, "experiment": label, "missing": "split"}
+    with collected(), suppress(ValueError):
+        found = SubspaceLTI(offset="constant", **roles).fit(table, y)
+        std = found.frequency_response_std(np.zeros(1))[0].real
+        longest = max(len(run.rows) for run in group)
+        if spectral_radius(found.lti_.A) < 1.0 - 1.0 / longest:
+            of_kappa = slice(len(inputs) - np.count_nonzero(moves), None)
+            slopes[moves] = found.lti_.dc_gain()[:, of_kappa].T
+            variances[moves] = std[:, of_kappa].T ** 2
+    return slopes, variances
 
 
 def _about_mean(signal: Array) -> Array:
