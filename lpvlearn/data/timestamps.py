@@ -201,7 +201,7 @@ def read_clock(
     t = seconds.astype(np.float64, copy=False)
     steps = np.diff(t)
     where = f"Time column {column!r} of experiment {experiment!r}"
-    _check_increasing(t, steps, where, local)
+    _check_increasing(t, steps, where, column, local)
     missing = missing_after(steps)
     kept = steps[~missing] if missing.any() else steps
     step, off = float(kept.mean()), _off_grid(t, missing)
@@ -243,7 +243,11 @@ def read_clock(
 
 
 def _check_increasing(
-    t: NDArray[np.float64], steps: NDArray[np.float64], where: str, local: bool
+    t: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    where: str,
+    column: Hashable,
+    local: bool,
 ) -> None:
     """Refuse stamps that stay or go back, with the remedy for what they look like."""
     if not steps.min() <= 0:
@@ -262,6 +266,11 @@ def _check_increasing(
         remedy = _OF_A_ZONE
     elif np.sum(steps <= 0) <= _FEW * len(t):
         remedy = _RESTARTS + remedy
+    else:
+        remedy = (
+            "Rows of a log that are only out of order are to be sorted, those of y "
+            f"with them: table.sort_values({column!r}) before it is taken apart. "
+        ) + remedy
     raise ValueError(
         f"{where} must increase. Got {t[k]:.9g} s followed by {t[k + 1]:.9g} s at "
         f"its samples {k} and {k + 1}. {remedy}"
