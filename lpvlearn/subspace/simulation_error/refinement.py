@@ -44,7 +44,7 @@ _MISS_WEIGHT, _LEAST_LEFT = 4.0, 2.5e-3
 
 ROUNDING = 1e-22  # share of the outputs' energy below which the error is rounding
 _STABLE_RADIUS = 1.0 - 1e-8  # of the circle that steps keep all poles in, once they are
-_EDGE = _STABLE_RADIUS - 1e-12  # beyond: on that circle, but for rounding
+_ROUNDED = 1e-12  # to either side of that circle
 
 # Damping of the steps tried in turn, relative to the largest squared singular value:
 # the whole step, then from the hardly determined directions to ever more of them, at
@@ -117,7 +117,7 @@ def refine_simulation(
         miss = predicted - gain
         model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
-        at_edge = block_radius(model.blocks or ()) > _EDGE  # which bounds the gain
+        at_edge = abs(block_radius(model.blocks or ()) - _STABLE_RADIUS) < _ROUNDED
         if left <= negligible or (at_edge and gain <= negligible):
             return model
     return model
@@ -138,27 +138,32 @@ def _accepted(
     trials: Iterable[_Trial],
 ) -> tuple[_Trial, Realization] | None:
     """The first of ever shorter steps that reduces the error, and its model."""
-    radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
-    lasting = radius + 1.0 / max(record.n_samples for record in records)
+    radius = block_radius(model.blocks or ())
+    apart = 1.0 / max(record.n_samples for record in records)
+    # what grows over a record may grow faster; what hardly does may be an integrator
+    radius = max(_STABLE_RADIUS, radius + apart if radius > 1.0 + apart else radius)
     for trial in trials:
         moved = moved_model(model, trial.step, free)
-        blocks = moved.blocks or ()
-        if not block_radius(blocks) <= lasting:
+        blocks = tuple(_within(b, radius, radius + apart) for b in moved.blocks or ())
+        if block_radius(blocks) > radius + _ROUNDED:
             continue
-        blocks = tuple(_within(block, radius) for block in blocks)
         found = block_fit(blocks, moved.C, records, free)
         if found.loss < model.loss:
             return trial, found
     return None
 
 
-def _within(block: Array, radius: float) -> Array:
-    """A block of A, its poles beyond a radius taken back to it: others may move on."""
+def _within(block: Array, radius: float, farthest: float) -> Array:
+    """A block of A, a pole that integrates taken back to a radius: others may move on.
+
+    It is as it was where poles oscillate, or are beyond the `farthest`.
+    """
     if block_radius([block]) <= radius:
         return block
     poles, V = np.linalg.eig(block)
-    poles *= np.minimum(1.0, radius / np.abs(poles))
-    return np.asarray((V * poles @ np.linalg.pinv(V)).real)
+    if np.iscomplexobj(poles) or np.abs(poles).max() > farthest:
+        return block
+    return np.asarray(V * np.clip(poles, -radius, radius) @ np.linalg.pinv(V))
 
 
 def _trial_steps(
