@@ -153,6 +153,21 @@ def test_a_periodic_input_makes_no_resonance_of_it():
     assert _error(model) < 0.02
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 7])
+def test_the_clock_of_inputs_is_no_hum(seed):
+    """Drag of a vehicle answers every step of the thrust with a pulse of its own."""
+    rng, speeds, (speed, force) = np.random.default_rng(seed), [], (1.4, 0.0)
+    thrust = 2.0 + 1.5 * np.repeat(rng.choice([-1.0, 1.0], 151), 10)[:1500]
+    for u in thrust:
+        speeds.append(speed + 1e-3 * rng.standard_normal())
+        for _ in range(10):
+            speed += 0.01 * (force - speed * abs(speed))
+            force += 0.06 * (u * abs(u) / 2.0 - force)
+    _, (told,) = _fit(thrust[:, None], speeds)
+    assert "1.257" in told and "Inputs step every 10 samples" in told
+
+
 @pytest.mark.parametrize("gain", [0.0, 2.0])
 def test_it_may_be_all_that_moves(gain):
     rng = np.random.default_rng(5)

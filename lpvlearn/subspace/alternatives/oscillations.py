@@ -22,6 +22,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import linalg
 
+from ...data.faulty_signals import held_for
 from ..evidence.constants import CERTAIN
 from ..evidence.statistics import Evidence
 from ..fits.local_fit import LocalFit
@@ -96,16 +97,39 @@ def without_oscillations(
         size = np.sqrt(np.mean(motion**2, axis=0))
         largest = int(np.argmax(size / whole.evidence.output_scale))
         listed = ", ".join(f"{turn:.4g}" for turn in np.sort(turns))
-        samples.telling.once(
-            "oscillation",
+        seen = (
             f"Outputs oscillate where no input moves them, at {listed} rad per sample: "
             f"{size[largest]:.3g} (rms) of output {samples.telling.output(largest)}. "
-            "That was taken for a disturbance, as hum or runout is, and not for the "
-            f"plant's. Where it is the plant's, use order={len(whole.model.A)}; else "
-            "remove it at its source, or by the same notch filter on inputs and "
-            "outputs.",
         )
+        clock = _clock_of(samples, turns, whole.evidence.longest)
+        if clock:
+            samples.telling.once(
+                "oscillation",
+                f"{seen}Inputs step every {clock} samples, and a plant that is not "
+                "linear does so at each step: that was taken out. Use smaller inputs, "
+                "or steps that are not all of one length.",
+            )
+        else:
+            samples.telling.once(
+                "oscillation",
+                f"{seen}That was taken for a disturbance, as hum or runout is, and not "
+                f"for the plant's. Where it is the plant's, use order="
+                f"{len(whole.model.A)}; else remove it at its source, or by the same "
+                "notch filter on inputs and outputs.",
+            )
     return calm, fitted, turns
+
+
+def _clock_of(samples: Samples, turns: Array, longest: int) -> int:
+    """Samples for which an input is held, if sinusoids are of that clock; else 0."""
+    inputs = [u for u, _ in samples.pairs]
+    for j in range(inputs[0].shape[1]):
+        held = held_for([u[:, j] for u in inputs])
+        clock = 2.0 * np.pi / held
+        off = np.abs(turns - clock * np.round(turns / clock)) * longest
+        if held > 1 and (off < _NEAR).all():
+            return held
+    return 0
 
 
 def without_modes_of_few_lines(samples: Samples, fitted: LocalFit) -> LocalFit:
