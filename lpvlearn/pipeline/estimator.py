@@ -39,6 +39,7 @@ from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
+from ..lpv.rational import RationalLPV
 from ..lpv.spline import SplineLPV
 from ..metrics.reports import readable_report
 from ..metrics.scorers import InitialState
@@ -82,7 +83,7 @@ from .points.local_models import (
     is_left,
     tell_of_integrators,
 )
-from .points.mislabelled import tell_of_exchanged_values, tell_of_mislabelled
+from .points.mislabelled import tell_of_mislabelled, tell_of_wrong_values
 from .refining.coefficients import known_coefficients, local_covariance, refine_model
 from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along
@@ -869,8 +870,9 @@ list, default=None
         repeated = (len(kappa) - n_places) * found.theta.shape[1]
         dof = getattr(form, "degrees_of_freedom_", np.inf)
         saturated = not moving and dof <= repeated
-        if isinstance(form, SplineLPV) and self.restructurers_:
-            tell_of_exchanged_values(kappa, found.theta, found.covariance)
+        if isinstance(form, SplineLPV | RationalLPV) and self.restructurers_:
+            known = found.theta, found.covariance, self.scheduling_names_
+            tell_of_wrong_values(kappa, *known)
         if isinstance(form, SplineLPV) or (saturated and n_places > 2):
             tell_unforeseen(
                 self.lpv_,

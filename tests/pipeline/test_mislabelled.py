@@ -7,8 +7,8 @@ from lpvlearn import StateSpace
 from lpvlearn.exceptions import collected
 from lpvlearn.pipeline.points.local_models import LocalModel
 from lpvlearn.pipeline.points.mislabelled import (
-    tell_of_exchanged_values,
     tell_of_mislabelled,
+    tell_of_wrong_values,
 )
 
 KAPPA = np.arange(4.0)[:, None]
@@ -114,7 +114,26 @@ def test_points_that_have_the_values_of_one_another_are_named(law, pair):
     kappa[list(pair)] = kappa[list(pair[::-1])]
     words = f"point {pair[0]} .* and operating point {pair[1]} .* look exchanged"
     with pytest.warns(UserWarning, match=words):
-        tell_of_exchanged_values(kappa, theta, covariance)
+        tell_of_wrong_values(kappa, theta, covariance, ["speed"])
+
+
+@pytest.mark.parametrize("point", [0, 3, 5])
+@pytest.mark.parametrize(
+    "told, wrong",
+    [
+        ("Fahrenheit in place of Celsius: {:.4g} for", lambda x: 1.8 * x + 32.0),
+        ("radians in place of degrees", np.deg2rad),
+        ("thousandths in place of ones", lambda x: 1e3 * x),
+    ],
+)
+def test_a_point_with_another_unit_is_named(told, wrong, point):
+    theta, covariance = parameters(lambda k: 1.0 + 3.0 * k + k**2)
+    kappa = 20.0 + 10.0 * PLACES
+    told = told.format(kappa[point, 0])
+    kappa[point] = wrong(kappa[point])
+    words = rf"operating point {point} .* looks to have 'speed' in another .*{told}"
+    with pytest.warns(UserWarning, match=words):
+        tell_of_wrong_values(kappa, theta, covariance, ["speed"])
 
 
 @pytest.mark.parametrize(
@@ -129,6 +148,6 @@ def test_points_that_have_the_values_of_one_another_are_named(law, pair):
 )
 def test_laws_that_bend_are_no_exchange(law):
     theta, covariance = parameters(law)
-    tell_of_exchanged_values(PLACES, theta, covariance)
+    tell_of_wrong_values(PLACES, theta, covariance, ["speed"])
     unknown = np.full_like(covariance, np.nan)
-    tell_of_exchanged_values(PLACES[::-1], theta, unknown)
+    tell_of_wrong_values(PLACES[::-1], theta, unknown, ["speed"])

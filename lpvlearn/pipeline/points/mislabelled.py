@@ -1,7 +1,8 @@
 """Operating points where a channel has another unit, sign or place than elsewhere.
 
 That leaves its mark on a response: a constant ratio to what the other points foresee.
-And points that have the scheduling values of one another, which parameters tell.
+And points that have the scheduling values of one another, or one in another unit, which
+parameters tell.
 """
 
 from __future__ import annotations
@@ -42,6 +43,25 @@ _OTHERS = 3  # points that tell how much a channel varies
 # Degrees of a polynomial that meets parameters within their noise where two points, of
 # that many at most, are exchanged; and times its chi-square, at the least, as they are.
 _DEGREES, _MANY, _CLEARER = (1, 2), 15, 100.0
+
+# Units that are taken for one another: the first is so many times the second, and more
+_UNITS = (
+    (("degrees Fahrenheit", "Celsius"), 1.8, 32.0),
+    (("kelvin", "degrees Celsius"), 1.0, 273.15),
+    (("degrees", "radians"), 180.0 / np.pi, 0.0),
+    (("radians", "turns"), 2.0 * np.pi, 0.0),
+    (("turns a minute", "radians a second"), 30.0 / np.pi, 0.0),
+    (("seconds", "minutes"), 60.0, 0.0),
+    (("km/h", "m/s"), 3.6, 0.0),
+    (("feet", "metres"), 1.0 / 0.3048, 0.0),
+    (("knots", "m/s"), 3600.0 / 1852.0, 0.0),
+    (("tenths", "ones"), 10.0, 0.0),
+    (("percent", "ones"), 100.0, 0.0),
+    (("thousandths", "ones"), 1e3, 0.0),
+    (("millionths", "ones"), 1e6, 0.0),
+)
+
+_BEYOND_OTHERS = 0.5  # of the range of the others, at which a point may be an end
 
 _ROUND = 1.25  # from a power of ten, up to which a factor is told as that
 
@@ -85,43 +105,79 @@ def tell_of_mislabelled(
     return bool(told)
 
 
-def tell_of_exchanged_values(kappa: Array, theta: Array, covariance: Array) -> None:
-    """Warn of two points that have the scheduling values of one another.
+def tell_of_wrong_values(
+    kappa: Array, theta: Array, covariance: Array, names: Sequence[Hashable]
+) -> None:
+    """Warn of two points with the values of one another, or one in another unit.
 
     Where parameters `theta`, (n_points, n_params), of these `covariance` are met by a
-    low polynomial within their noise if two points are exchanged, far better than as
-    they are, and if no other two are.
+    low polynomial within their noise with the values of the scheduling variables, of
+    these `names`, as they are to be then, far better than as they are, and in no other
+    way.
     """
     n = len(kappa)
     if n > _MANY or not np.isfinite(covariance).all():
         return
 
-    def forms(places: NDArray[np.intp]) -> list[PolynomialLPV]:
+    def forms(places: Array) -> list[PolynomialLPV]:
         found = []
         for degree in _DEGREES:
             with suppress(ValueError):  # the points are too few
                 form = PolynomialLPV(degree)
-                found.append(form.fit(kappa[places], theta, covariance=covariance))
+                found.append(form.fit(places, theta, covariance=covariance))
         # two values beside the coefficients of every parameter
         return [f for f in found if f.degrees_of_freedom_ >= 2 * theta.shape[1]]
 
-    as_is = forms(np.arange(n))
+    as_is = forms(kappa)
     if not as_is or any(map(noise_explains, as_is)):
         return
     most = min(form.chi2_ for form in as_is) / _CLEARER
-    found = []
-    for i, j in combinations(range(n), 2):
-        places = np.arange(n)
-        places[[i, j]] = j, i
-        if any(noise_explains(f) and f.chi2_ < most for f in forms(places)):
-            found.append((i, j))
+    found: dict[tuple[int, int | None], tuple[float, str]] = {}
+    for where, places, message in _other_values(kappa, names):
+        fits = [f.chi2_ for f in forms(places) if noise_explains(f) and f.chi2_ < most]
+        if fits and min(fits) < found.get(where, (np.inf,))[0]:
+            found[where] = min(fits), message
     if len(found) == 1:
-        first, second = (place_of(k, kappa) for k in found[0])
+        ((_, message),) = found.values()
         warn(
-            f"the records of {first} and {second} look exchanged: with the scheduling "
-            "values of one another all parameters follow a simple law within their "
-            "standard deviations, and as they stand by far not. Check which is which."
+            f"{message}: all parameters follow a simple law within their standard "
+            "deviations then, and as they stand by far not. Give the values as they "
+            "are to be there, and fit again."
         )
+
+
+def _other_values(
+    kappa: Array, names: Sequence[Hashable]
+) -> Iterator[tuple[tuple[int, int | None], Array, str]]:
+    """Points, the scheduling values as they may be meant, and what would be wrong.
+
+    Two points, or one that is far beyond all others, and among them in another unit.
+    """
+    for i, j in combinations(range(len(kappa)), 2):
+        places = kappa.copy()
+        places[[i, j]] = kappa[[j, i]]
+        first, second = place_of(i, kappa), place_of(j, kappa)
+        message = (
+            f"the records of {first} and {second} look exchanged, with the scheduling "
+            "values of one another"
+        )
+        yield (i, j), places, message
+    for k, (j, name) in product(range(len(kappa)), enumerate(names)):
+        value, others = kappa[k, j], np.delete(kappa[:, j], k)
+        beyond = _BEYOND_OTHERS * np.ptp(others)
+        low, high = others.min() - beyond, others.max() + beyond
+        for said, factor, less in () if low <= value <= high else _UNITS:
+            for back in (True, False):
+                meant = (value - less) / factor if back else factor * value + less
+                if low <= meant <= high:
+                    places = kappa.copy()
+                    places[k, j] = meant
+                    unit = " in place of ".join(said if back else said[::-1])
+                    message = (
+                        f"{place_of(k, kappa)} looks to have {name!r} in another unit "
+                        f"than the others ({unit}: {meant:.4g} for {value:.4g})"
+                    )
+                    yield (k, None), places, message
 
 
 def _responses(local: Sequence[LocalModel], longest: float) -> Complex:
