@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ...systems.least_squares import column_scale, scaled_lstsq, thin_svd
 from ..samples.records import Record, output_energy
+from .criterion import PRICE
 from .signals import SharedSignals, block_radius
 from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_model
 
@@ -73,10 +74,11 @@ def refine_simulation(
     Starts from a model of `simulation_fit` on these records, scaled to comparable size
     channel by channel, or where it is not `fitted` on one that is like this single
     record, `signals` then those of the model and inputs that it shares with others.
-    Only steps that reduce the error are taken; a stable model stays stable. A model
-    without section form (poles of high multiplicity), of order 0, or whose simulation
-    overflows is returned as it is. `patient` goes on along valleys: of orders that are
-    compared, too high a one would follow slow noise there.
+    Only steps that reduce the error are taken; a stable model stays stable, and one
+    that grows by less than noise may tell integrates. A model without section form
+    (poles of high multiplicity), of order 0, or whose simulation overflows is
+    returned as it is. `patient` goes on along valleys: of orders that are compared,
+    too high a one would follow slow noise there.
 
     The steps end where one more could not gain what a hundredth of the noise on
     each parameter costs. What is left after a step follows from how far the decrease
@@ -85,10 +87,36 @@ def refine_simulation(
     """
     if model.A.size == 0 or (fitted and not np.isfinite(model.loss)):
         return model
+    limit = max_iter or (_MANY if patient else _MAX_ITER)
+    shared = None if fitted else signals
+    found = _refined(model, records, free, limit, patient, fitted, shared)
+    apart = 1.0 / max(record.n_samples for record in records)
+    if not 1.0 <= block_radius(found.blocks or ()) < 1.0 + apart:
+        return found
+    # what grows by next to nothing may integrate
+    blocks = tuple(_within(b, _STABLE_RADIUS, 1.0 + apart) for b in found.blocks or ())
+    if block_radius(blocks) > _STABLE_RADIUS + _ROUNDED:
+        return found
+    other = block_fit(blocks, found.C, records, free)
+    other = _refined(other, records, free, limit, patient)
+    n_values = sum(record.y.size for record in records)
+    return other if other.loss < (1.0 + PRICE / n_values) * found.loss else found
+
+
+def _refined(
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    limit: int,
+    patient: bool,
+    fitted: bool = True,
+    signals: SharedSignals | None = None,
+) -> Realization:
+    """As `refine_simulation`."""
     energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
     damping = 0.0
-    for _ in range(max_iter or (_MANY if patient else _MAX_ITER)):
+    for _ in range(limit):
         if model.loss <= ROUNDING * energy or model.blocks is None:
             return model
         regression = linearised(
