@@ -80,15 +80,15 @@ from .points.local_models import (
     LocalModel,
     channel_sizes,
     estimates_outputs,
+    integrating_outputs,
     is_left,
-    tell_of_integrators,
 )
 from .points.mislabelled import tell_of_mislabelled, tell_of_wrong_values
 from .refining.coefficients import known_coefficients, local_covariance, refine_model
 from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along
 from .reports.html_report import html_report
-from .reports.tables import Summary, Tables, summarise, tables
+from .reports.tables import Summary, Tables, fit_of, summarise, tables
 from .running.memory import checked_memory
 from .running.runner import PointRunner
 from .running.workers import check_jobs
@@ -103,6 +103,7 @@ _DEFAULTS = {
     "interpolator": AutoLPV,
 }
 
+_POORER = 1.1  # of squared errors: those of models that know of integrators
 _PATIENCE = 2.0  # seconds after which one asks oneself what is going on
 
 
@@ -151,7 +152,8 @@ class LocalLPVPipeline(ScheduledEstimator):
         restructurer's structure where it has one, less where a state would but follow
         the noise, with a pole on the negative real axis; else one order for all points:
         that of most evidence, all their records together, or a lower one, with a
-        warning, where points left out are foreseen by that alone.
+        warning, where points left out are foreseen by that alone. Without a structure
+        outputs that integrate at all points are found, with a warning that names them.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" interpolates the entries of
         the local models, each turned to its neighbour by the rotation that brings their
@@ -846,17 +848,75 @@ list, default=None
         if self.restructurer in (None, "aligned") and not wrong:
             quiet = replace(runner, verbose=0)
             again = partial(identify, points=kept, runner=quiet)
+            estimator, local = self._integrated(estimator, local, kept, again, told)
             said = len(told)
             order = _foreseen_order(estimator, local, kept, longest, again)
             if order is not None:
                 del told[:said]  # of the models of more states
                 estimator = clone(estimator).set_params(order=order)
                 local, kept = identify(estimator, points, runner)
-            tell_of_integrators(local, self.output_names_, longest)
         take_back(LINE)  # the LPV model rests where it begins
         if points is not whole:
             tell_of_held(first.scheduling_names)
         return local, kept
+
+    def _integrated(
+        self,
+        estimator: Any,
+        local: list[LocalModel],
+        points: OperatingPoints,
+        identify: Callable[..., tuple[list[LocalModel], OperatingPoints]],
+        told: list[Told],
+    ) -> tuple[Any, list[LocalModel]]:
+        """An estimator that knows which outputs integrate, and its models.
+
+        Without a structure the rate of an integrator may jump with the scheduling
+        variable, and the integrator keeps that.
+        """
+        places = integrating_outputs(local, self.sampling_time_ * points.n_longest)
+        if not places:
+            return estimator, local
+        names = [self.output_names_[k] for k in places]
+        what = (
+            f"outputs {names} integrate at all operating points, as a position does: "
+            "their local models have a pole that does not decay over the record. "
+        )
+        knowing = clone(estimator)
+        found: list[LocalModel] = []
+        with collected() as later, suppress(ValueError):
+            found, kept = identify(knowing.set_params(integrating=places))
+            if len(kept) < len(points) or self._are_poorer(found, local, points):
+                found = []
+        if not found:
+            warn(
+                f"{what}Without a structure an LPV model drifts off where that is not "
+                f"known. Use local=SubspaceLTI(integrating={names})."
+            )
+            return estimator, local
+        told[:] = later
+        warn(
+            f"{what}They were identified by their rates, and integrated. Use "
+            f"local=SubspaceLTI(integrating={names}) to say so."
+        )
+        return knowing, found
+
+    def _are_poorer(
+        self,
+        found: Sequence[LocalModel],
+        others: Sequence[LocalModel],
+        points: OperatingPoints,
+    ) -> bool:
+        """Whether models leave more of the local experiments than other ones."""
+
+        def error(models: Sequence[LocalModel]) -> float:
+            pairs = zip(models, points.experiments, strict=True)
+            fits = [
+                fit_of(m.lti, group, self.sampling_time_, m.n_trend, m.hold)
+                for m, group in pairs
+            ]
+            return float(np.sum((100.0 - np.array(fits)) ** 2))
+
+        return not error(found) < _POORER * error(others)
 
     def _tell_between(
         self, found: StructuredModels, longest: float, moving: bool

@@ -308,20 +308,37 @@ def test_nothing_is_said_of_distances_between_integrators():
     assert "through the local models" not in text and "nan" not in text
 
 
-@pytest.mark.slow
-def test_a_structure_may_integrate_without_a_word():
-    """A ship's heading: no warning, and parameters within what is said of them."""
-    ship = GrayBoxStructure.from_template([[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0]])
-    runs, true, rng = [], [], np.random.default_rng(1)
+SHIP = GrayBoxStructure.from_template([[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0]])
+
+
+def headings(seed):
+    """A ship's at three speeds, with a biased rudder, and its parameters there."""
+    runs, true, rng = [], [], np.random.default_rng(seed)
     for speed in (4.0, 6.0, 8.0):
         true.append([0.01 * speed, 0.0012 * speed**2])
         u = np.repeat(rng.choice([-10.0, 10.0], 30), 20) + rng.normal(0.0, 2.0, 600)
-        y = ship.model(true[-1]).simulate(u - u.mean(), sampling_time=1.0)
+        y = SHIP.model(true[-1]).simulate(u - u.mean(), sampling_time=1.0)
         y += 90.0 + 0.005 * y.std() * rng.standard_normal(y.shape)
         runs.append((u - u.mean() + 1.0, speed, y))
-    X, y = from_trajectories(runs, sampling_time=1.0)
+    return *from_trajectories(runs, sampling_time=1.0), true
+
+
+@pytest.mark.slow
+def test_integrators_without_a_structure_are_found():
+    """They jumped with the speed, and the integrator kept that: fits of -90 to 95 %."""
     roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
-    model = LocalLPVPipeline(restructurer=GrayBoxRestructurer(ship), **roles).fit(X, y)
+    with pytest.warns(UserWarning, match="identified by their rates, and integrated"):
+        model = LocalLPVPipeline(**roles).fit(*headings(0)[:2])
+    for seed in (0, 1, 2):
+        assert model.score(*headings(seed)[:2]) > 0.998
+
+
+@pytest.mark.slow
+def test_a_structure_may_integrate_without_a_word():
+    """No warning, and parameters within what is said of them."""
+    X, y, true = headings(1)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    model = LocalLPVPipeline(restructurer=GrayBoxRestructurer(SHIP), **roles).fit(X, y)
     off = (model.parameters_ - np.array(true)) / model.parameters_std_
     assert off.abs().to_numpy().max() < 3.5
     assert (model.parameters_std_ / np.array(true) < 3e-3).all(axis=None)

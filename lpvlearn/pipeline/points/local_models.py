@@ -768,27 +768,16 @@ def _integrating_places(lti: StateSpace, rate: float) -> list[int]:
     return np.flatnonzero(seen > _STANDING * seen.max()).tolist()
 
 
-def tell_of_integrators(
-    local: Sequence[LocalModel], names: Sequence[Hashable], longest: float
-) -> None:
-    """Tell of outputs that integrate at all points, though nobody said so.
+def integrating_outputs(local: Sequence[LocalModel], longest: float) -> list[int]:
+    """Places of outputs that integrate at all points, though nobody said so.
 
     By a pole that does not decay by more than next to nothing in the `longest` record
-    (seconds). Without a structure the rate may jump with the scheduling variable, and
-    the integrator keeps that.
+    (seconds).
     """
     found = [_integrating_places(model.lti, _HARDLY / longest) for model in local]
     if any(model.integrating for model in local) or not all(found):
-        return
-    places = sorted(set.intersection(*map(set, found)))
-    if places:
-        named = [names[k] for k in places]
-        warn(
-            f"outputs {named} integrate at all operating points, as a position does: "
-            "their local models have a pole that does not decay over the record. "
-            "Without a structure an LPV model drifts off where that is not known. Use "
-            f"local=SubspaceLTI(integrating={named})."
-        )
+        return []
+    return sorted(set.intersection(*map(set, found)))
 
 
 def _integrating_outputs(lti: StateSpace, rate: float) -> str:

@@ -104,17 +104,17 @@ def tables(
             "n_samples": sum(len(e.rows) for e in group),
             "order": model.order,
             "horizon": model.horizon,
-            "local_BFT": _fit_of(model.lti, *known),
+            "local_BFT": fit_of(model.lti, *known),
         }
         missed |= lpv.offsets is None and _misses_constants(model, *known[:2], lpv.hold)
         if found.restructurers:
-            structured = _fit_of(gray_box, *known)
+            structured = fit_of(gray_box, *known)
             row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
         frozen = lpv.at(points.kappa[k])
         row["lpv_BFT"] = np.nan
         if not frozen.poles().real.max(initial=0.0) > 0.0:
-            row["lpv_BFT"] = _fit_of(frozen, *known)
+            row["lpv_BFT"] = fit_of(frozen, *known)
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
@@ -200,7 +200,7 @@ def _integrates(model: StateSpace) -> bool:
     return bool(rates.min(initial=1.0) <= _ABOUT_ZERO * rates.max(initial=0.0))
 
 
-def _fit_of(
+def fit_of(
     model: StateSpace,
     group: Sequence[Experiment],
     sampling_time: float,
@@ -246,7 +246,7 @@ def _misses_constants(
         return False  # they have been looked for
     group, constants = group[:_LOOKED_AT], max(1, model.n_trend)
     best, without = (
-        _fit_of(model.lti, group, sampling_time, n, hold) for n in (constants, 0)
+        fit_of(model.lti, group, sampling_time, n, hold) for n in (constants, 0)
     )
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
     return best - without > _WORTH or (without < _POOR and any(far))
