@@ -34,8 +34,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh, solve_sylvester, svd
-from scipy.optimize import least_squares
+from scipy.linalg import eigh, schur
+from scipy.linalg.lapack import dtrsyl
+from scipy.optimize import leastsq
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
@@ -53,6 +54,7 @@ _APART = 1e-9  # of points at one place: a graph takes a distance of zero for no
 # Rates at which states are forgotten, by the modulus of the reference's fastest pole.
 _FORGOTTEN = (0.0, 1e-3, 1e-2, 0.1, 1.0)
 
+_SMALL = 1e-8  # changes, relative to what is left, from which no step is worth it
 _STEPS = 100  # neighbours take ten; models that are no neighbours have no nearest basis
 
 
@@ -88,8 +90,8 @@ def aligned_models(
         largest = max(m.hankel_singular_values().max(initial=0.0) for m in models)
         aligned = [_normal(model, largest, states == STATES[1]) for model in models]
     for k in order[1:]:
-        turn = rotation_to(aligned[k], aligned[parents[k]]).T
-        aligned[k] = aligned[k].transform(turn)
+        (turn,) = rotations_to([aligned[k]], aligned[parents[k]])
+        aligned[k] = aligned[k].transform(turn.T)
     return aligned
 
 
@@ -117,37 +119,58 @@ def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
     return order, parents
 
 
-def rotation_to(model: StateSpace, reference: StateSpace) -> Array:
-    """Orthogonal T by which the model's matrices are nearest to the reference's.
+def rotations_to(models: Sequence[StateSpace], reference: StateSpace) -> list[Array]:
+    """Orthogonal T by which the matrices of each model are nearest to the reference's.
 
     Examples
     --------
     >>> import numpy as np
     >>> model = StateSpace([[-1, 2], [-2, -3]], [[1], [0]], [[1, 1]]).balance()
     >>> turned = model.transform([[0, 1], [-1, 0]])
-    >>> rotation_to(turned, model).round(9) + 0.0
+    >>> rotations_to([turned], model)[0].round(9) + 0.0
     array([[ 0.,  1.],
            [-1.,  0.]])
     """
-    if not model.order:
-        return np.zeros((0, 0))
-    distance = _Distance(model, reference)
-    fastest = np.abs(reference.poles()).max()
-    starts = []
-    for share in _FORGOTTEN:
-        U, _, V = svd(_correlation(model, reference, share * fastest))
-        starts.append(np.asarray(U @ V))
-    lengths = [np.linalg.norm(distance.residuals(T)) for T in starts]
-    return distance.nearest(starts[int(np.argmin(lengths))])
+    if not reference.order:
+        return [np.zeros((0, 0)) for _ in models]
+    form = schur(reference.A)
+    weight = _weight(reference, form)
+    rates = np.abs(reference.poles()).max() * np.array(_FORGOTTEN)
+    found = []
+    for model in models:
+        distance = _Distance(model, reference, weight)
+        U, _, Vt = np.linalg.svd(_correlations(model, reference, form, rates))
+        starts = U @ Vt
+        lengths = np.linalg.norm(distance.residuals(starts), axis=-1)
+        found.append(distance.nearest(starts[int(np.argmin(lengths))]))
+    return found
 
 
-def _correlation(model: StateSpace, reference: StateSpace, rate: float) -> Array:
-    """X + Y of the states of two models that forget at a rate."""
-    forget = rate * np.eye(model.order)
-    A, A_r = model.A - forget, reference.A - forget
-    X = solve_sylvester(A, A_r.T, -model.B @ reference.B.T)
-    Y = solve_sylvester(A.T, A_r, -model.C.T @ reference.C)
-    return np.asarray(X + Y)
+def _correlations(
+    model: StateSpace, reference: StateSpace, form: tuple[Array, Array], rates: Array
+) -> Array:
+    """X + Y of the states of two models that forget at each of some rates.
+
+    By Bartels and Stewart, where one Schur form of A_r (`form`) serves all rates.
+    """
+    (R, U), (S, V), eye = schur(model.A), form, np.eye(model.order)
+    driven = -U.T @ model.B @ reference.B.T @ V
+    shown = -U.T @ model.C.T @ reference.C @ V
+    found = np.empty((len(rates), *eye.shape))
+    for k, rate in enumerate(rates):
+        pair = R - rate * eye, S - rate * eye
+        found[k] = dtrsyl(*pair, driven, tranb="T")[0]
+        found[k] += dtrsyl(*pair, shown, trana="T")[0]
+    return np.asarray(U @ found @ V.T)
+
+
+def _weight(reference: StateSpace, form: tuple[Array, Array]) -> Array:
+    """S^(1/2) / w^(1/2) of a reference."""
+    gramian = _correlations(reference, reference, form, np.zeros(1))[0] / 2.0
+    energy, basis = eigh((gramian + gramian.T) / 2.0)
+    root = basis * np.sqrt(np.maximum(energy, 0.0)) @ basis.T
+    rate = np.linalg.norm(reference.A @ root) / np.linalg.norm(root)
+    return np.asarray(root / np.sqrt(rate))
 
 
 class _Distance:
@@ -156,13 +179,8 @@ class _Distance:
     K is skew-symmetric, with the unknowns k above its diagonal (Cayley's transform).
     """
 
-    def __init__(self, model: StateSpace, reference: StateSpace) -> None:
-        self.model, self.reference = model, reference
-        gramian = _correlation(reference, reference, 0.0) / 2.0
-        energy, basis = eigh((gramian + gramian.T) / 2.0)
-        root = basis * np.sqrt(np.maximum(energy, 0.0)) @ basis.T
-        rate = np.linalg.norm(reference.A @ root) / np.linalg.norm(root)
-        self.root = root / np.sqrt(rate)
+    def __init__(self, model: StateSpace, reference: StateSpace, root: Array) -> None:
+        self.model, self.reference, self.root = model, reference, root
         self.above = np.triu_indices(model.order, 1)
 
     def nearest(self, start: Array) -> Array:
@@ -170,20 +188,25 @@ class _Distance:
         n_unknowns = len(self.above[0])
         if not n_unknowns:
             return start
-        found = least_squares(
+        found = leastsq(  # least_squares checks for longer than these steps take
             lambda k: self.residuals(start @ self._turn(k)[0]),
             np.zeros(n_unknowns),
-            lambda k: self._jacobian(start, k),
-            method="lm",
-            max_nfev=_STEPS,
+            Dfun=lambda k: self._jacobian(start, k),
+            full_output=True,  # and so no warning
+            col_deriv=True,
+            ftol=_SMALL,
+            xtol=_SMALL,
+            gtol=_SMALL,
+            maxfev=_STEPS,
+            diag=np.ones(n_unknowns),
         )
-        return np.asarray(start @ self._turn(found.x)[0])
+        return np.asarray(start @ self._turn(found[0])[0])
 
     def residuals(self, T: Array) -> Array:
-        model, reference = self.model, self.reference
+        model, reference, back = self.model, self.reference, T.swapaxes(-1, -2)
         return self._stacked(
-            T.T @ model.A @ T - reference.A,
-            T.T @ model.B - reference.B,
+            back @ model.A @ T - reference.A,
+            back @ model.B - reference.B,
             model.C @ T - reference.C,
         )
 
@@ -198,15 +221,15 @@ class _Distance:
         K[self.above] = k
         K -= K.T
         eye = np.eye(len(K))
-        inverse = np.linalg.inv(eye - K)
+        inverse = np.asarray(np.linalg.inv(eye - K), float)
         return inverse @ (eye + K), inverse
 
     def _jacobian(self, start: Array, k: Array) -> Array:
-        """A change of K turns T on by the skew W = 2 (I + K)^-1 dK (I - K)^-1."""
+        """Rows: a change of K turns T on by W = 2 (I + K)^-1 dK (I - K)^-1, skew."""
         turn, inverse = self._turn(k)
         T = start @ turn
         A, B, C = T.T @ self.model.A @ T, T.T @ self.model.B, self.model.C @ T
         row, column = self.above
         half = inverse[row][:, :, None] * inverse[column][:, None, :]
         W = 2.0 * (half - half.swapaxes(1, 2))
-        return self._stacked(A @ W - W @ A, -W @ B, C @ W).T
+        return self._stacked(A @ W - W @ A, -W @ B, C @ W)

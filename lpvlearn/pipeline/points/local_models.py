@@ -17,7 +17,7 @@ from sklearn.base import clone
 from ...data.experiments import ROLES, Experiment, as_table
 from ...data.preparation import DETRENDS
 from ...exceptions import Told, collected, retold, take_back, warn
-from ...lpv.alignment import rotation_to
+from ...lpv.alignment import rotations_to
 from ...models.statespace import (
     ModelPair,
     StateSpace,
@@ -638,7 +638,8 @@ def _in_one_basis(
     models = _of_lowest_order(models)  # where none grew
     models = balanced_models([scaled(model, u, y) for model in models])
     first, *others = _of_lowest_order(models)  # nor lost what is rounding
-    turned = [first, *(m.transform(rotation_to(m, first).T) for m in others)]
+    turns = rotations_to(others, first)
+    turned = [first, *(m.transform(T.T) for m, T in zip(others, turns, strict=True))]
     return [scaled(model, 1.0 / u, 1.0 / y) for model in turned]
 
 
