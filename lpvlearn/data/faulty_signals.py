@@ -204,6 +204,8 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
     found: list[tuple[int, int, int]] = []
     in_motion = caught_up = n_new = n_twice = 0
     steps = np.abs(np.concatenate([np.diff(y) for y in signals]))
+    if steps.all():  # the usual case
+        return []
     usual = np.median(steps[steps > 0.0]) if steps.any() else 0.0
     for e, y in enumerate(signals):
         k = _edges(y)
@@ -234,17 +236,20 @@ def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
     >>> wraps([angle], [np.ones((400, 1))]), wraps([angle], [angle[:, None]])
     (7, 0)
     """
-    y, u = np.concatenate(signals), np.vstack(inputs)
-    low, width, widths = y.min(), np.ptp(y), np.ptp(u, axis=0)
-    n_turns, largest = 0, 0.0
-    for signal, moved in zip(signals, inputs, strict=True):
-        steps = np.abs(np.diff(signal))
-        far = steps > _REVOLUTION * width
-        largest = max(largest, steps[~far].max(initial=0.0))
+    y = np.concatenate(signals)
+    low, width = y.min(), np.ptp(y)
+    steps = [np.abs(np.diff(signal)) for signal in signals]
+    turns = [step > _REVOLUTION * width for step in steps]
+    if sum(map(np.count_nonzero, turns)) < _REVOLUTIONS:  # the usual case
+        return 0
+    others = (step[~far] for step, far in zip(steps, turns, strict=True))
+    largest = max(step.max(initial=0.0) for step in others)
+    widths = np.ptp(np.vstack(inputs), axis=0)
+    for moved, far in zip(inputs, turns, strict=True):
         jumps = (np.abs(np.diff(moved, axis=0)) > _OTHER_STEPS * widths).any(axis=1)
         for lag in range(3):  # which a plant may take
             far[lag:] &= ~jumps[: max(len(jumps) - lag, 0)]
-        n_turns += int(far.sum())
+    n_turns = sum(map(np.count_nonzero, turns))
     place = (y - low) / (width or 1.0)
     between = np.mean((place > 0.2) & (place < 0.8)) > _BETWEEN
     found = n_turns >= _REVOLUTIONS and largest < _OTHER_STEPS * width and between
