@@ -28,7 +28,7 @@ from .. import (
 from ..datasets import make_flexible_arm
 from ..pipeline.estimator import Stopwatch
 from ..pipeline.one_basis.black_boxes import balanced_entries
-from ..pipeline.points.local_models import experiments_of, identify_point
+from ..pipeline.points.local_models import experiments_of, unheard_model
 from ..pipeline.running.runner import PointRunner
 from ..pipeline.running.workers import started
 from .tables import (
@@ -150,7 +150,7 @@ def run_paper_experiment(
     runner = PointRunner(n_jobs, verbose, "raise", Memory(memory, verbose=0))
     compared = runner.start(
         f"local models by {other}",
-        identify_point,
+        unheard_model,
         [
             (SubspaceLTI(data.structure.order, method=other, **_LOCAL), runs)
             for runs in _experiments(data)
@@ -198,7 +198,7 @@ def run_paper_experiment(
         meanwhile(experiment)
     waiting = f"local models by {other}, beyond the time of the two before"
     with watch.step(waiting, bar=True):
-        comparison = [done.result.lti for done in compared() if done is not None]
+        comparison = [done.result for done in compared() if done is not None]
     tables["table1_other"] = local_table(comparison, data)
     tables["timing"] = watch.table()
     return replace(experiment, comparison=comparison)

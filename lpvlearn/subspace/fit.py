@@ -62,8 +62,9 @@ def fit_samples(
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     outputs = [y for _, y in pairs]
-    tell_of_still_outputs(outputs, telling)
-    tell_of_dropouts(pairs, telling)
+    if not telling.silent:
+        tell_of_still_outputs(outputs, telling)
+        tell_of_dropouts(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     samples = samples._replace(pairs=pairs)
     fitted = with_trends(samples, like)

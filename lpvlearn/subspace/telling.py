@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from copy import copy
 from dataclasses import dataclass, field
 from operator import index
 from typing import Self, SupportsIndex
 
 from ..exceptions import warn
+
+_UNHEARD: ContextVar[bool] = ContextVar("unheard", default=False)
+
+
+@contextmanager
+def unheard() -> Iterator[None]:
+    """Have the fits of the block, in this thread, tell nothing."""
+    token = _UNHEARD.set(True)
+    try:
+        yield
+    finally:
+        _UNHEARD.reset(token)
 
 
 @dataclass
@@ -22,7 +36,7 @@ class Telling:
     inputs: Sequence[Hashable] | None = None
     outputs: Sequence[Hashable] | None = None
     kinds: set[str] = field(default_factory=set)  # of warnings that were given
-    silent: bool = False
+    silent: bool = field(default_factory=_UNHEARD.get)
 
     def __contains__(self, kind: str) -> bool:
         return kind in self.kinds

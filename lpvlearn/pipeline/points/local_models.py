@@ -28,6 +28,7 @@ from ...restructuring.minimise_covariance import Estimate
 from ...subspace.diagnosis.fit_warnings import OF_LASTING
 from ...subspace.evidence.constants import CERTAIN
 from ...subspace.fits.integrating import integrating_flags
+from ...subspace.telling import unheard
 from ...systems.modes import lasting, n_changes
 
 Array = NDArray[np.float64]
@@ -154,6 +155,14 @@ def identify_point(
     return _pooled(
         pooled, experiments, discretization, advice, efficient, about_zero, deviate
     )
+
+
+def unheard_model(
+    local: Any, experiments: Sequence[Experiment], **options: Any
+) -> StateSpace:
+    """That of `identify_point`, of samples of which all is told by another fit."""
+    with unheard():
+        return identify_point(local, experiments, **options).lti
 
 
 def _pooled(
