@@ -161,9 +161,10 @@ def _woken(n_jobs: int) -> Iterator[None]:
 
 
 def _enter(room: str) -> None:
-    """Import a room; none of it is garbage that need be looked for meanwhile."""
+    """Import a room; none of it is garbage that need be looked for, then or later."""
     gc.disable()
     import_module(room)
+    gc.freeze()
     gc.enable()
 
 
