@@ -30,22 +30,23 @@ alone that goes through zero, in "output-normal" ones B.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh, schur
 from scipy.linalg.lapack import dtrsyl
-from scipy.optimize import leastsq
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
 from ..models.scheduling_range import in_range_of_points
 from ..models.statespace import StateSpace
 from ..systems.balancing import gramian_factor
+from ..systems.least_squares import Rows, levenberg_marquardt
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int32]
+Places = NDArray[np.int32]
 
 _DIGITS = 9  # of distances from the middle, beyond which they are equal
 
@@ -54,8 +55,11 @@ _APART = 1e-9  # of points at one place: a graph takes a distance of zero for no
 # Rates at which states are forgotten, by the modulus of the reference's fastest pole.
 _FORGOTTEN = (0.0, 1e-3, 1e-2, 0.1, 1.0)
 
-_SMALL = 1e-8  # changes, relative to what is left, from which no step is worth it
+_SMALL = 1e-12  # part of a cost by which no fall is worth another step
 _STEPS = 100  # neighbours take ten; models that are no neighbours have no nearest basis
+
+# Of the derivatives of models that are turned at once
+_NUMBERS = 2**20
 
 
 # States of which both Gramians are the Hankel singular values, or one is the identity
@@ -102,7 +106,7 @@ def _normal(model: StateSpace, size: float, by_inputs: bool) -> StateSpace:
     return model.transform(root * np.linalg.inv(L) if by_inputs else L.T / root)
 
 
-def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
+def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Places, Places]:
     """Points in an order in which each follows its neighbour, and these neighbours.
 
     From the point in the middle outward, or from the one farthest outside; the
@@ -136,13 +140,12 @@ def rotations_to(models: Sequence[StateSpace], reference: StateSpace) -> list[Ar
     form = schur(reference.A)
     weight = _weight(reference, form)
     rates = np.abs(reference.poles()).max() * np.array(_FORGOTTEN)
-    found = []
-    for model in models:
-        distance = _Distance(model, reference, weight)
-        U, _, Vt = np.linalg.svd(_correlations(model, reference, form, rates))
-        starts = U @ Vt
-        lengths = np.linalg.norm(distance.residuals(starts), axis=-1)
-        found.append(distance.nearest(starts[int(np.argmin(lengths))]))
+    at_once, found = max(1, _NUMBERS // reference.order**4), []
+    for i in range(0, len(models), at_once):
+        some = models[i : i + at_once]
+        correlations = [_correlations(m, reference, form, rates) for m in some]
+        U, _, Vt = np.linalg.svd(np.array(correlations))
+        found += [*_Distance(some, reference, weight).nearest(U @ Vt)]
     return found
 
 
@@ -176,60 +179,70 @@ def _weight(reference: StateSpace, form: tuple[Array, Array]) -> Array:
 class _Distance:
     """What is minimised, as residuals of rotations T = T_0 (I - K)^-1 (I + K).
 
-    K is skew-symmetric, with the unknowns k above its diagonal (Cayley's transform).
+    K is skew-symmetric, with the unknowns k above its diagonal (Cayley's transform). Of
+    several models, all of them at once.
     """
 
-    def __init__(self, model: StateSpace, reference: StateSpace, root: Array) -> None:
-        self.model, self.reference, self.root = model, reference, root
-        self.above = np.triu_indices(model.order, 1)
+    def __init__(
+        self, models: Sequence[StateSpace], reference: StateSpace, root: Array
+    ) -> None:
+        self.models = [np.array([getattr(m, M) for m in models]) for M in "ABC"]
+        self.reference, self.root = reference, root
+        self.above = np.triu_indices(reference.order, 1)
 
-    def nearest(self, start: Array) -> Array:
-        """T at the minimum that a start leads to."""
-        n_unknowns = len(self.above[0])
-        if not n_unknowns:
-            return start
-        found = leastsq(  # least_squares checks for longer than these steps take
-            lambda k: self.residuals(start @ self._turn(k)[0]),
-            np.zeros(n_unknowns),
-            Dfun=lambda k: self._jacobian(start, k),
-            full_output=True,  # and so no warning
-            col_deriv=True,
-            ftol=_SMALL,
-            xtol=_SMALL,
-            gtol=_SMALL,
-            maxfev=_STEPS,
-            diag=np.ones(n_unknowns),
+    def nearest(self, starts: Array) -> Array:
+        """T of every model at the minimum that the best of its starts leads to."""
+        n_models, n_starts, n, _ = starts.shape
+        rows = np.repeat(np.arange(n_models), n_starts)
+        lengths = np.linalg.norm(
+            self.residuals(*self.turned(rows, starts.reshape(-1, n, n))), axis=1
         )
-        return np.asarray(start @ self._turn(found[0])[0])
+        best = lengths.reshape(n_models, n_starts).argmin(axis=1)
+        start = starts[range(n_models), best]
 
-    def residuals(self, T: Array) -> Array:
-        model, reference, back = self.model, self.reference, T.swapaxes(-1, -2)
-        return self._stacked(
-            back @ model.A @ T - reference.A,
-            back @ model.B - reference.B,
-            model.C @ T - reference.C,
+        def residuals(k: Array, rows: Rows) -> tuple[Array, Callable[[Rows], Array]]:
+            turn, inverse = self.turn(k)
+            now = self.turned(rows, start[rows] @ turn)
+
+            def jacobian(kept: Rows) -> Array:
+                return self.jacobian(*(M[kept] for M in (*now, inverse)))
+
+            return self.residuals(*now), jacobian
+
+        unknowns = np.zeros((n_models, len(self.above[0])))
+        found = levenberg_marquardt(
+            residuals, unknowns, max_iter=_STEPS, tol=_SMALL, patience=1
         )
+        return np.asarray(start @ self.turn(found.x)[0])
+
+    def turned(self, rows: Rows, T: Array) -> tuple[Array, Array, Array]:
+        """A, B and C of some models in other bases."""
+        (A, B, C), back = (M[rows] for M in self.models), T.swapaxes(-1, -2)
+        return back @ A @ T, back @ B, C @ T
+
+    def residuals(self, A: Array, B: Array, C: Array) -> Array:
+        """Differences from the reference as rows of residuals, weighed."""
+        known = self.reference
+        return self._stacked(A - known.A, B - known.B, C - known.C)
 
     def _stacked(self, A: Array, B: Array, C: Array) -> Array:
-        """Differences (..., rows, columns) as rows of residuals, weighed."""
         parts = (A @ self.root, self.root @ A, B, C)
-        return np.concatenate([M.reshape(*M.shape[:-2], -1) for M in parts], axis=-1)
+        rows = [M.reshape(*M.shape[:-2], prod(M.shape[-2:])) for M in parts]
+        return np.concatenate(rows, axis=-1)
 
-    def _turn(self, k: Array) -> tuple[Array, Array]:
+    def turn(self, k: Array) -> tuple[Array, Array]:
         """(I - K)^-1 (I + K), and (I - K)^-1."""
-        K = np.zeros_like(self.root)
-        K[self.above] = k
-        K -= K.T
-        eye = np.eye(len(K))
+        K = np.zeros((len(k), *self.root.shape))
+        K[:, *self.above] = k
+        K -= K.swapaxes(1, 2)
+        eye = np.eye(len(self.root))
         inverse = np.asarray(np.linalg.inv(eye - K), float)
         return inverse @ (eye + K), inverse
 
-    def _jacobian(self, start: Array, k: Array) -> Array:
-        """Rows: a change of K turns T on by W = 2 (I + K)^-1 dK (I - K)^-1, skew."""
-        turn, inverse = self._turn(k)
-        T = start @ turn
-        A, B, C = T.T @ self.model.A @ T, T.T @ self.model.B, self.model.C @ T
+    def jacobian(self, A: Array, B: Array, C: Array, inverse: Array) -> Array:
+        """A change of K turns T on by the skew W = 2 (I + K)^-1 dK (I - K)^-1."""
         row, column = self.above
-        half = inverse[row][:, :, None] * inverse[column][:, None, :]
-        W = 2.0 * (half - half.swapaxes(1, 2))
-        return self._stacked(A @ W - W @ A, -W @ B, C @ W)
+        half = inverse[:, row, :, None] * inverse[:, column, None, :]
+        W = 2.0 * (half - half.swapaxes(-1, -2))
+        A, B, C = (M[:, None] for M in (A, B, C))
+        return self._stacked(A @ W - W @ A, -W @ B, C @ W).swapaxes(1, 2)

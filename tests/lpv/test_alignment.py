@@ -54,17 +54,21 @@ def test_a_model_and_itself_turned_agree(order):
 
 def test_the_derivatives_are_those_of_the_residuals():
     model, reference = (stable_model(seed, 4).balance() for seed in (1, 2))
-    distance = _Distance(model, reference, stable_model(3, 4).A)
+    distance = _Distance([model], reference, stable_model(3, 4).A)
     rng = np.random.default_rng(0)
     start = np.linalg.qr(rng.normal(size=(4, 4)))[0]
-    k, step = rng.normal(size=6), 1e-6
+    k, step = rng.normal(size=(1, 6)), 1e-6
 
-    def residuals(k):
-        return distance.residuals(start @ distance._turn(k)[0])
+    def turned(k):
+        return distance.turned([0], start @ distance.turn(k)[0])
 
-    changes = [residuals(k + e) - residuals(k - e) for e in step * np.eye(6)]
-    J = distance._jacobian(start, k)
-    assert_allclose(J, np.array(changes) / (2 * step), atol=1e-8)
+    changes = [
+        distance.residuals(*turned(k + e)) - distance.residuals(*turned(k - e))
+        for e in step * np.eye(6)[:, None]
+    ]
+    J = distance.jacobian(*turned(k), distance.turn(k)[1])
+    expected = np.array(changes).transpose(1, 2, 0) / (2 * step)
+    assert_allclose(J, expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("damping", [0.1, 0.01, 0.001])
