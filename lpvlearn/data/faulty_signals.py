@@ -141,6 +141,9 @@ def drops_out(
     steps = np.abs(np.concatenate([np.diff(y) for y in known]))
     if not np.count_nonzero(steps) > _CHANGES * len(steps):
         return None
+    large = np.count_nonzero(_APART * steps >= steps.max())
+    if large > (1.0 - _MOST) * len(steps) + 2:  # the usual case
+        return None
     least = _APART * np.quantile(steps, _MOST)
     found: dict[float, list[tuple[int, int, int]]] = {}
     for e, y in enumerate(signals):

@@ -259,9 +259,9 @@ def _tells_of_glitches(fitted: LocalFit, telling: Telling) -> bool:
 def _confirms_means_alone(fitted: LocalFit) -> bool:
     """Whether parts held out move as no model without constants foresees at all."""
     held_out, evidence = fitted.selection.held_out, fitted.evidence
-    if held_out is None or evidence.free.n_trend or not stays_far(evidence.records):
+    if held_out is None or evidence.free.n_trend or not held_out.bft < _NOTHING:
         return False
-    return bool(held_out.bft < _NOTHING)
+    return stays_far(evidence.records)
 
 
 def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
