@@ -17,7 +17,7 @@ from lpvlearn.subspace.diagnosis.fit_warnings import warn_about
 from lpvlearn.subspace.fit import fit_samples
 from lpvlearn.subspace.fits.one_fit import Samples
 from lpvlearn.subspace.fits.options import Choices, check_options
-from lpvlearn.subspace.telling import Telling
+from lpvlearn.subspace.telling import Telling, unheard
 from lpvlearn.systems.simulation import lti_response
 
 A = 0.9 * np.array([[np.cos(0.6), np.sin(0.6)], [-np.sin(0.6), np.cos(0.6)]])
@@ -383,6 +383,19 @@ def test_inputs_that_do_not_reach_an_output_need_no_static_gain():
         assert not across.diagonal().any()
         n_unknown += across.sum()
     assert n_unknown > 0
+
+
+def test_a_fit_that_nobody_hears_is_the_same(rng):
+    u, y = record(rng)
+    y = y + 0.1 * rng.standard_normal(y.shape)
+    y[100] = y[200] = 50.0  # which `fit` tells of
+    with pytest.warns(UserWarning):
+        heard = SubspaceLTI(2).fit(u, y)
+    with unheard():
+        silent = SubspaceLTI(2).fit(u, y)
+    for matrix in "ABCD":
+        expected = getattr(heard.lti_, matrix)
+        np.testing.assert_array_equal(getattr(silent.lti_, matrix), expected)
 
 
 def swinging(seed, decay):
