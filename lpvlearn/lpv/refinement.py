@@ -122,26 +122,41 @@ class Refined(NamedTuple):
     n_iter: int  # steps tried
 
 
-def simulated(
-    model: LPVStateSpace, record: Record, own: Own, weight: Array | None = None
+def responses_along(
+    model: LPVStateSpace, record: Record, own: Own
 ) -> tuple[Array, Array]:
-    """Errors (n_samples, n_outputs) of a model, and the own unknowns behind them.
+    """Outputs by themselves (n_samples, n_outputs), and by the own unknowns.
 
-    These make the least of the weighted errors: weighted by how far outputs move, if
-    not otherwise. Raises a DivergenceError.
+    They do not depend on the measured outputs. Raises a DivergenceError.
     """
-    if weight is None:
-        weight = weights_of([record])
     if own.initial_state:
         y, free = model.rest_and_free_responses(record.u, record.kappa, record.dt)
         free = free[:, :, : model.order]
     else:
         y = model.simulate(record.u, record.kappa, record.dt)
         free = np.zeros((*y.shape, 0))
+    return y, own.columns(free)
+
+
+def simulated(
+    model: LPVStateSpace,
+    record: Record,
+    own: Own,
+    weight: Array | None = None,
+    responses: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array]:
+    """Errors (n_samples, n_outputs) of a model, and the own unknowns behind them.
+
+    These make the least of the weighted errors: weighted by how far outputs move, if
+    not otherwise. The `responses_along` the record may be known. Raises a
+    DivergenceError.
+    """
+    if weight is None:
+        weight = weights_of([record])
+    y, columns = responses or responses_along(model, record, own)
     error = record.y - y
-    if not (own.initial_state or own.constant):
+    if not columns.shape[2]:
         return -error, np.zeros(0)
-    columns = own.columns(free)
     found = estimate_initial_state(columns * weight[:, None], error * weight)
     return columns @ found - error, found
 

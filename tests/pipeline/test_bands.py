@@ -8,6 +8,9 @@ import pytest
 from sklearn.linear_model import LinearRegression
 
 from lpvlearn import LocalLPVPipeline, OutputErrorLPV
+from lpvlearn.data.experiments import Experiment
+from lpvlearn.lpv.refinement import Own, Record, simulated
+from lpvlearn.pipeline.refining.errors import errors_along
 
 from ..conftest import (
     ROLES,
@@ -170,3 +173,15 @@ def test_errors_are_as_large_as_told():
         error = model.predict(new) - truth.to_numpy()
         scores.append(np.mean((error[20:] / std.to_numpy()[20:]) ** 2))
     assert 0.4 < np.mean(scores) < 2.0
+
+
+def test_each_of_some_realizations_has_errors_of_its_own():
+    rng, lpv, own = np.random.default_rng(0), spring_lpv(), Own(True, True)
+    u, other = rng.normal(size=(2, 50, 1))
+    kappa = np.full((50, 1), 0.4)
+    y = rng.normal(size=(4, 50, 1))
+    runs = [Record(v, z, kappa, 0.02) for v, z in zip([u, u, other, u], y, strict=True)]
+    named = [Experiment(k, np.arange(50), r.u, r.y) for k, r in enumerate(runs)]
+    found = errors_along(lpv, named, runs, own)
+    for errors, run in zip(found, runs, strict=True):
+        np.testing.assert_array_equal(errors, simulated(lpv, run, own)[0])

@@ -18,7 +18,15 @@ from ...data.experiments import Experiment, naming
 from ...exceptions import warn
 from ...lpv.bands import levels_of
 from ...lpv.model import LPVStateSpace
-from ...lpv.refinement import Own, Record, refine, simulated, squares, weights_of
+from ...lpv.refinement import (
+    Own,
+    Record,
+    refine,
+    responses_along,
+    simulated,
+    squares,
+    weights_of,
+)
 from ...lpv.weighting import is_chance
 from ..checks.bands import output_errors
 from ..checks.error_warnings import tell_of_noisy_scheduling
@@ -66,12 +74,25 @@ def errors_along(
     records: Sequence[Record],
     own: Own,
 ) -> list[Array]:
-    """Simulation errors of runs, each with the unknowns of its own that fit best."""
-    errors = []
+    """Simulation errors of runs, each with the unknowns of its own that fit best.
+
+    Realizations that follow each other are simulated once.
+    """
+    errors: list[Array] = []
+    last: Record | None = None
     for e, record in zip(experiments, records, strict=True):
         with naming(e):
-            errors.append(simulated(model, record, own)[0])
+            if last is None or not _alike(record, last):
+                responses = responses_along(model, record, own)
+            errors.append(simulated(model, record, own, responses=responses)[0])
+        last = record
     return errors
+
+
+def _alike(one: Record, other: Record) -> bool:
+    """Whether two runs differ in their outputs at most."""
+    same = np.array_equal(one.u, other.u) and np.array_equal(one.kappa, other.kappa)
+    return same and one.dt == other.dt
 
 
 def local_output_errors(
