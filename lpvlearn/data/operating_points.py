@@ -160,8 +160,11 @@ def _without_spikes(
     scale = np.where(extent > 0, extent, np.abs(middle).max(axis=0))
     for k in moving:
         signal = signals[k]
+        steps = np.abs(np.diff(signal, axis=0))
+        if (_ABOUT // 2 * steps.max(axis=0) < _STEP * scale).all():
+            continue  # within so many steps of the median
         about = median_filter(signal, size=(_ABOUT, 1), mode="nearest")
-        usual = np.quantile(np.abs(np.diff(signal, axis=0)), _MOST, axis=0)
+        usual = np.quantile(steps, _MOST, axis=0)
         far = np.abs(signal - about) > np.maximum(_SPIKE * usual, _STEP * scale)
         if far.any():
             first, j = np.argwhere(far)[0]
