@@ -30,7 +30,7 @@ from ..pipeline.estimator import Stopwatch
 from ..pipeline.one_basis.black_boxes import balanced_entries
 from ..pipeline.points.local_models import experiments_of, unheard_model
 from ..pipeline.running.runner import PointRunner
-from ..pipeline.running.workers import started
+from ..pipeline.running.workers import give_way, started
 from .tables import (
     ParameterSet,
     interpolation_table,
@@ -150,7 +150,7 @@ def run_paper_experiment(
     runner = PointRunner(n_jobs, verbose, "raise", Memory(memory, verbose=0))
     compared = runner.start(
         f"local models by {other}",
-        unheard_model,
+        _compared,
         [
             (SubspaceLTI(data.structure.order, method=other, **_LOCAL), runs)
             for runs in _experiments(data)
@@ -213,6 +213,12 @@ def _experiments(data: Bunch) -> list[Any]:
         experiments_of(*pair, data.sampling_time)
         for pair in zip(u.reshape(shape), y.reshape(shape), strict=True)
     ]
+
+
+def _compared(local: SubspaceLTI, experiments: Any, **options: Any) -> StateSpace:
+    """The local model of a point by the other method, while this one goes on."""
+    give_way()
+    return unheard_model(local, experiments, **options)
 
 
 def _interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpace:

@@ -25,6 +25,8 @@ from ...validation import shown
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
+_NICE = 3  # half the share of a processor that others have
+
 _KILLED = (
     "A worker process was killed before its work was done, most often for want of "
     "memory. Take fewer `n_jobs` (each holds its own copy of what it works on), or "
@@ -84,6 +86,20 @@ def end_what_begins_with_this_process() -> None:
     executor = reusable_executor._executor
     if executor is not None and executor._initializer is None:
         executor._initializer, executor._initargs = end_with_parent, (os.getpid(),)
+
+
+@cache
+def give_way() -> None:
+    """Have the process of a task work in the background from now on.
+
+    The one that it works for goes on with other things, which else would be last.
+    """
+    if _is_worker() and hasattr(os, "nice"):
+        os.nice(_NICE)
+
+
+def _is_worker() -> bool:
+    return multiprocessing.current_process().name.startswith("LokyProcess")
 
 
 def started(n_jobs: int | None) -> Callable[[], None]:
@@ -175,7 +191,7 @@ def _in_worker(
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
 ) -> Any:
-    if multiprocessing.current_process().name.startswith("LokyProcess"):
+    if _is_worker():
         within = asked_by == os.getpid()  # a fit of a search, say
         end_with_parent(os.getppid() if within else asked_by)
         _freeze_modules()
