@@ -382,11 +382,16 @@ def _clocks(
     seconds = time_in_seconds(column.values, column.name)
     local = are_local_times(column.values)
     clocks: list[Clock] = []
-    rule = "All experiments must have the same time step"
+    rule, last = "All experiments must have the same time step", seconds[:0]
     for label, rows in zip(labels, groups, strict=True):
+        stamps = seconds[rows]
+        if clocks and np.array_equal(stamps, last):
+            clocks.append(clocks[-1])
+            continue
+        last = stamps
         common = next((c for c in clocks if c.step is not None), UNTIMED)
         clock = read_clock(
-            seconds[rows],
+            stamps,
             column=column.name,
             experiment=label,
             local=local,
