@@ -88,7 +88,7 @@ from .refining.coefficients import known_coefficients, local_covariance, refine_
 from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along
 from .reports.html_report import html_report
-from .reports.tables import Summary, Tables, fit_of, summarise, tables
+from .reports.tables import Measured, Summary, Tables, fit_of, summarise, tables
 from .running.memory import checked_memory
 from .running.runner import PointRunner
 from .running.workers import check_jobs
@@ -908,11 +908,12 @@ list, default=None
     ) -> bool:
         """Whether models leave more of the local experiments than other ones."""
 
+        measured = [Measured.of(group) for group in points.experiments]
+
         def error(models: Sequence[LocalModel]) -> float:
-            pairs = zip(models, points.experiments, strict=True)
             fits = [
-                fit_of(m.lti, group, self.sampling_time_, m.n_trend, m.hold)
-                for m, group in pairs
+                fit_of(m.lti, known, self.sampling_time_, m.n_trend, m.hold)
+                for m, known in zip(models, measured, strict=True)
             ]
             return float(np.sum((100.0 - np.array(fits)) ** 2))
 

@@ -98,7 +98,7 @@ def tables(
     for k, (group, model, gray_box) in enumerate(
         zip(points.experiments, found.local, found.models, strict=True)
     ):
-        known = group, sampling_time, model.n_trend, lpv.hold
+        known = Measured.of(group), sampling_time, model.n_trend, lpv.hold
         row: dict[str, Any] = {
             "n_experiments": len({e.label for e in group}),
             "n_samples": sum(len(e.rows) for e in group),
@@ -106,7 +106,9 @@ def tables(
             "horizon": model.horizon,
             "local_BFT": fit_of(model.lti, *known),
         }
-        missed |= lpv.offsets is None and _misses_constants(model, *known[:2], lpv.hold)
+        missed |= lpv.offsets is None and _misses_constants(
+            model, group, sampling_time, lpv.hold
+        )
         if found.restructurers:
             structured = fit_of(gray_box, *known)
             row["structured_BFT"] = structured
@@ -200,9 +202,32 @@ def _integrates(model: StateSpace) -> bool:
     return bool(rates.min(initial=1.0) <= _ABOUT_ZERO * rates.max(initial=0.0))
 
 
+class Measured(NamedTuple):
+    """Experiments as models are compared with them."""
+
+    size: Array  # how far outputs move
+    # Of each length: inputs (length, n_inputs, n_runs), one run if all are alike, and
+    # outputs channel by channel in memory, as experiments are: (n_outputs, n_runs,
+    # length)
+    parts: list[tuple[Array, Array]]
+
+    @classmethod
+    def of(cls, group: Sequence[Experiment]) -> Measured:
+        size = spread_of(np.vstack([e.measured for e in group]))
+        parts = []
+        for length in sorted({len(e.rows) for e in group}):
+            part = [e for e in group if len(e.rows) == length]
+            inputs = [e.inputs for e in part]
+            if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
+                inputs = inputs[:1]
+            y = np.stack([e.measured.T for e in part], axis=1)
+            parts.append((np.stack(inputs, axis=-1), y))
+        return cls(size, parts)
+
+
 def fit_of(
     model: StateSpace,
-    group: Sequence[Experiment],
+    measured: Measured,
     sampling_time: float,
     n_trend: int,
     hold: str = "zoh",
@@ -216,22 +241,16 @@ def fit_of(
     sampled = model.to_discrete(sampling_time, hold)
     if n_trend and _integrates(model):  # what offsets of the inputs add up to
         n_trend = 2
-    size = spread_of(np.vstack([e.measured for e in group]))
     true, simulated = [], []
-    for length in sorted({len(e.rows) for e in group}):
-        part = [e for e in group if len(e.rows) == length]
-        inputs = [e.inputs for e in part]
-        if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
-            inputs = inputs[:1]
-        u = delayed(np.stack(inputs, axis=-1), sampled.input_delay)
+    for inputs, y in measured.parts:
+        length, u = len(inputs), delayed(inputs, sampled.input_delay)
         x = state_trajectory(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
         free = unknown_responses(sampled, length, trend_signals(length, n_trend))
-        # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
         forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
-        y = np.stack([e.measured.T for e in part], axis=1)
-        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1), size)
+        errors = (y - forced).transpose(2, 0, 1)
+        own = estimate_initial_state(free, errors, measured.size)
         found = forced + own.T @ free.transpose(1, 2, 0)
         true.append(y.reshape(model.n_outputs, -1))
         simulated.append(found.reshape(model.n_outputs, -1))
@@ -245,8 +264,9 @@ def _misses_constants(
     if model.rest is not None and not model.n_trend:
         return False  # they have been looked for
     group, constants = group[:_LOOKED_AT], max(1, model.n_trend)
+    measured = Measured.of(group)
     best, without = (
-        fit_of(model.lti, group, sampling_time, n, hold) for n in (constants, 0)
+        fit_of(model.lti, measured, sampling_time, n, hold) for n in (constants, 0)
     )
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
     return best - without > _WORTH or (without < _POOR and any(far))
