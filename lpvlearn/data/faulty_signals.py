@@ -252,7 +252,7 @@ def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
         jumps = (np.abs(np.diff(moved, axis=0)) > _OTHER_STEPS * widths).any(axis=1)
         for lag in range(3):  # which a plant may take
             far[lag:] &= ~jumps[: max(len(jumps) - lag, 0)]
-    n_turns = sum(map(np.count_nonzero, turns))
+    n_turns = sum(int(far.sum()) for far in turns)
     place = (y - low) / (width or 1.0)
     between = np.mean((place > 0.2) & (place < 0.8)) > _BETWEEN
     found = n_turns >= _REVOLUTIONS and largest < _OTHER_STEPS * width and between
