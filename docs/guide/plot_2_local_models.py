@@ -385,7 +385,8 @@ print(told[0].message)
 #   experiment where inputs are: :ref:`guide_logs`.
 # * ``integrating="angle"`` identifies the rate of an output that integrates, and
 #   integrates the model: see the example of a position servo. A pipeline without a
-#   structure interpolates the model of the rates, and integrates that.
+#   structure interpolates the model of the rates, and integrates that, also where it
+#   finds itself, and says, that an output integrates at all points.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
 #   that cost.
 

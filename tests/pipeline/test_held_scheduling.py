@@ -10,7 +10,7 @@ from joblib import Memory
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
 from lpvlearn.data.experiments import read_experiments
 from lpvlearn.data.operating_points import local_experiments
-from lpvlearn.pipeline.points.held_scheduling import _held, slopes_at_rest
+from lpvlearn.pipeline.points.held_scheduling import _held, curve_at_rest
 from lpvlearn.pipeline.running.runner import PointRunner
 
 ROLES = {"scheduling": "charge", "experiment": "run", "time": "t"}
@@ -78,7 +78,7 @@ def test_outputs_that_follow_the_scheduling_are_no_mode_of_the_plant():
 
 
 @pytest.mark.slow
-def test_slopes_are_those_of_each_point_where_few_points_tell_no_curve():
+def test_curves_are_those_of_each_point_where_few_points_tell_none():
     """Also beside a mode that is slow."""
     X, y = discharged(1200, 1e-3, 5e-5, rest=with_knee, decay=0.01)
     restructurer = GrayBoxRestructurer(CELL)
@@ -90,15 +90,15 @@ def test_slopes_are_those_of_each_point_where_few_points_tell_no_curve():
 
 
 @pytest.mark.slow
-def test_slope_is_exact_without_noise():
-    X, y = discharged(noise=0.0, moved=1e-5)
+def test_curves_are_exact_without_noise():
+    X, y = discharged(noise=0.0, moved=5e-5)
     for group in points_of(X, y).experiments:
         (run,) = group
         charge = run.kappa.mean()
-        curve = 0.9 + 2.0 * 0.3 * charge
-        slope, variance = slopes_at_rest(group)
-        np.testing.assert_allclose(slope, curve, rtol=1e-3)
-        assert variance < 1e-6
+        found = curve_at_rest(group)
+        np.testing.assert_allclose(found.slopes, 0.9 + 2.0 * 0.3 * charge, rtol=1e-3)
+        np.testing.assert_allclose(found.bows, 0.3, rtol=1e-2)
+        assert found.variances < 1e-6
 
 
 def test_held_experiments_lack_only_what_the_scheduling_moved():

@@ -9,10 +9,10 @@ slowly, which a model of constant scheduling takes for a mode that hardly decays
 place of one of the plant. What has moved with it, ``y0(kappa(t)) - y0(mean)``, is
 subtracted where the models of the points are likelier without.
 
-What outputs stand at over the points tells how ``y0`` bends, if inputs stand at one
-level everywhere. Its slope at a point the experiments there tell better: it is the
-static gain from the scheduling variables, were they inputs. Where the two disagree, the
-points are too few to tell a curve, and a line with that slope is taken.
+What outputs stand at over the points tells whether that matters, if inputs stand at one
+level everywhere, and their slope about where it is. The experiments at a point tell it
+better: as the static gain from the scheduling variables, and where it is likelier so
+from their squares, were they inputs.
 
 Not where that follows an output itself: what schedules itself is no motion beside the
 plant's, but its own.
@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +46,7 @@ _Identified: TypeAlias = "tuple[list[LocalModel], OperatingPoints]"
 
 # Share of the outputs' motion that is worth it, and what it leaves of one that is the
 # scheduling variable itself; steps from sample to sample, as a share of the outputs'
-# and of its own size, from which it is not slow; and what slopes may add to a curve
-# through the points that is one.
+# and of its own size, from which it is not slow; and what slopes of points may add.
 _SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.2, 0.1, 0.5, 0.5
 
 _MOST = 1_000_000  # samples, of tables that may lie on a disk
@@ -121,13 +120,13 @@ def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | Non
     if not (_farthest(bends) > _SLIGHT).any():
         return None
     known = replace(runner, verbose=0).run(
-        "slopes at rest",
-        slopes_at_rest,
+        "curves at rest",
+        curve_at_rest,
         [(group,) for group in points.experiments],
         points.kappa,
     )
-    slopes = [done.result for done in known if done is not None]
-    changes = _changes(points, bends, slopes, sizes[1])
+    curves = [done.result for done in known if done is not None]
+    changes = _changes(points, bends, curves, sizes[1])
     moves = _moves(changes, [run.measured / sizes[1] for run in runs])
     if not moves.any():
         return None
@@ -139,31 +138,28 @@ def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | Non
 def _changes(
     points: OperatingPoints,
     bends: Sequence[Array],
-    slopes: Sequence[tuple[Array, Array]],
+    curves: Sequence[Curve],
     size: Array,
 ) -> list[Array]:
     """What outputs at rest do within every run, in units of their `size`.
 
-    By curves through the points, `bends`, and the slopes of each, which may be noise.
+    By the curve of each point, whose slope may be noise beside that of what the points
+    tell together, `bends`.
     """
     paths = [[_about_mean(run.kappa) for run in g] for g in points.experiments]
     travelled = _square([path for some in paths for path in some])
     steep = _square(bends) / np.where(travelled > 0.0, travelled, np.inf)[:, None]
-    curves, lines, added = iter(bends), [], []
-    for some, (slope, variance) in zip(paths, slopes, strict=True):
-        own = np.vstack([next(curves) for _ in some])
-        bent = np.linalg.lstsq(np.vstack(some), own)[0]
-        variance = variance / size**2
+    ends = np.cumsum([len(some) for some in paths])[:-1]
+    together = np.split(np.arange(len(bends)), ends)
+    changes = []
+    for some, own, curve in zip(paths, together, curves, strict=True):
+        bent = np.linalg.lstsq(np.vstack(some), np.vstack([bends[k] for k in own]))[0]
+        variance = curve.variances / size**2
         total = steep + variance  # of what a slope may be beside, and its error
-        more = slope / size - bent
-        more *= np.divide(steep, total, out=np.zeros_like(total), where=total > 0.0)
-        lines += [path @ (bent + more) for path in some]
-        added += [path @ more for path in some]
-    agree = _square(added) < _ADDED**2 * _square(bends)
-    return [
-        np.where(agree, bend + more, line)
-        for bend, more, line in zip(bends, added, lines, strict=True)
-    ]
+        share = np.divide(steep, total, out=np.zeros_like(total), where=total > 0.0)
+        slopes = bent + share * (curve.slopes / size - bent)
+        changes += [path @ slopes + _bowed(path) @ curve.bows / size for path in some]
+    return changes
 
 
 def _farthest(bends: Sequence[Array]) -> Array:
@@ -190,31 +186,53 @@ def _without(run: Experiment, change: Array) -> Experiment:
     return replace(run, outputs=run.measured - change, scheduling=still)
 
 
-def slopes_at_rest(group: Sequence[Experiment]) -> tuple[Array, Array]:
-    """Of outputs at rest over the scheduling variables, (n_scheduling, n_outputs).
+class Curve(NamedTuple):
+    """Outputs at rest over the scheduling variables about a point."""
 
-    And their variances, at one point; infinite where slopes are not told.
+    slopes: Array  # (n_scheduling, n_outputs)
+    bows: Array  # likewise, of the squares
+    variances: Array  # likewise, of the slopes; infinite where these are not told
+
+
+def curve_at_rest(group: Sequence[Experiment]) -> Curve:
+    """That of one point: static gains from scheduling variables and their squares.
+
+    Squares where the model is likelier with them.
     """
     kappa = [_about_mean(run.kappa) for run in group]
     moves = np.asarray(np.vstack(kappa).any(axis=0))
-    slopes = np.zeros((len(moves), group[0].measured.shape[1]))
-    variances = np.full_like(slopes, np.inf)
-    driven = [
-        replace(run, inputs=np.hstack([run.inputs, path[:, moves]]), input_names=())
-        for run, path in zip(group, kappa, strict=True)
-    ]
-    table, y = as_table(driven)
-    *inputs, label = table.columns
-    roles = {"inputs": inputs, "experiment": label, "missing": "split"}
-    with collected(), suppress(ValueError):
-        found = SubspaceLTI(offset="constant", **roles).fit(table, y)
-        std = found.frequency_response_std(np.zeros(1))[0].real
-        longest = max(len(run.rows) for run in group)
-        if spectral_radius(found.lti_.A) < 1.0 - 1.0 / longest:
-            of_kappa = slice(len(inputs) - np.count_nonzero(moves), None)
-            slopes[moves] = found.lti_.dc_gain()[:, of_kappa].T
-            variances[moves] = std[:, of_kappa].T ** 2
-    return slopes, variances
+    n = np.count_nonzero(moves)
+    paths = [path[:, moves] for path in kappa]
+    shape = len(moves), group[0].measured.shape[1]
+    curve = Curve(np.zeros(shape), np.zeros(shape), np.full(shape, np.inf))
+    likeliest = np.inf
+    for causes in (paths, [np.hstack([path, _bowed(path)]) for path in paths]):
+        driven = [
+            replace(run, inputs=np.hstack([run.inputs, cause]), input_names=())
+            for run, cause in zip(group, causes, strict=True)
+        ]
+        table, y = as_table(driven)
+        *inputs, label = table.columns
+        roles = {"inputs": inputs, "experiment": label, "missing": "split"}
+        with collected(), suppress(ValueError):
+            found = SubspaceLTI(offset="constant", **roles).fit(table, y)
+            std = found.frequency_response_std(np.zeros(1))[0].real
+            longest = max(len(run.rows) for run in group)
+            lasts = spectral_radius(found.lti_.A) > 1.0 - 1.0 / longest
+            if lasts or not found.criterion() < likeliest:
+                continue
+            likeliest = found.criterion()
+            first = group[0].inputs.shape[1]
+            gain = found.lti_.dc_gain()[:, first:].T
+            curve.slopes[moves], curve.bows[moves] = gain[:n], 0.0
+            if len(gain) > n:
+                curve.bows[moves] = gain[n:]
+            curve.variances[moves] = std[:, first : first + n].T ** 2
+    return curve
+
+
+def _bowed(path: Array) -> Array:
+    return _about_mean(path**2)
 
 
 def _about_mean(signal: Array) -> Array:
