@@ -101,6 +101,7 @@ def test_curves_are_exact_without_noise():
         assert found.variances < 1e-6
 
 
+@pytest.mark.slow
 def test_held_experiments_lack_only_what_the_scheduling_moved():
     X, y = discharged()
     points = points_of(X, y)
@@ -131,6 +132,7 @@ def test_noise_of_the_scheduling_stays():
     assert _held(points_of(X, y), RUNNER) is None
 
 
+@pytest.mark.slow
 def test_every_output_is_held_by_itself():
     rng, (X, y) = np.random.default_rng(0), discharged()
     other = X.assign(output=0.01 * X["current"] + rng.standard_normal(4)[X["run"]])
@@ -141,6 +143,7 @@ def test_every_output_is_held_by_itself():
     np.testing.assert_allclose(beside.measured[:, 0], alone.measured[:, 0], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_slopes_that_noise_tells_give_way_to_what_the_points_tell():
     rng, (X, y) = np.random.default_rng(0), discharged()
     clean = X["charge"]
