@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import linalg
 
 from ...systems.beginnings import moves_of
 from ..evidence.constants import (
@@ -16,6 +17,7 @@ from ..evidence.constants import (
     may_have_constants,
     may_have_drift,
     stands_by_chance,
+    stays_far,
     unmoved_errors,
 )
 from ..evidence.offsets import N_TRENDS
@@ -23,6 +25,7 @@ from ..evidence.rounding import rounded_outputs
 from ..evidence.statistics import Evidence
 from ..fits.local_fit import LocalFit
 from ..fits.one_fit import Samples, TooFewSamples
+from ..samples.records import Record
 from .drift import n_lasting, outlasts, wanders
 
 # Share of the outputs' size left unexplained that constants may be the reason of
@@ -32,6 +35,8 @@ _HARDLY = 0.4
 # that they do not move at all.
 _NOT_MOVED = 1.1
 
+_DECAYS = 1e-2  # of a mode over the longest experiment, that stands for a constant
+
 
 def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     """Choose and identify, with constants of the experiments where these matter."""
@@ -40,14 +45,20 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
     judged = samples.having(refine="simulation") if rough else samples
-    fitted = judged.fit(n_trend, like)
+    auto = choices.offset == "auto"
+    moves = any(np.ptp(u, axis=0).any() for u, _ in samples.pairs)
+    first, sure = None, False
+    if auto and moves and not given and like is None:
+        first, sure = _with_constants_first(judged)
+    fitted = first if first and sure else judged.fit(n_trend, like)
+    n_trend = fitted.evidence.free.n_trend
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
     # so does one of a model that has to start at rest. In the errors of a poor model of
     # a given order nothing stands out.
     hides = fitted.method == "pbsid" or not choices.initial_states
     hides |= given and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
-    stands = choices.offset == "auto" and stands_by_chance(tested)
+    stands = auto and stands_by_chance(tested)
 
     def may_matter() -> bool:
         if hides or stands:
@@ -57,9 +68,8 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
         )
 
     refused = np.inf
-    moves = any(np.ptp(u, axis=0).any() for u, _ in samples.pairs)
-    if choices.offset == "auto" and moves and may_matter():
-        other = judged.fit(1, fitted)
+    if auto and moves and not sure and may_matter():
+        other = first or judged.fit(1, fitted)
         order = len(fitted.model.A)
         if stands and len(other.model.A) > order:
             as_many, worse = judged.of_order(order, other, 1)
@@ -79,10 +89,35 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
         shown = not (given or hides or rough)
         return shown and _may_drift_off(judged, fitted)
 
-    if choices.offset == "auto" and moves and may_drift():
+    if auto and moves and may_drift():
         fitted = _with_drifts(judged, fitted, refused)
         n_trend = fitted.evidence.free.n_trend
     return samples.fit(n_trend, fitted) if rough else fitted
+
+
+def _with_constants_first(samples: Samples) -> tuple[LocalFit | None, bool]:
+    """The model with constants, of signals that stay far from zero: they mostly matter.
+
+    And whether one without them is refuted, by those that few steps lead to from this:
+    with another mode in their place, or a state more, which hardly decays.
+    """
+    if not stays_far([Record.of(u, y) for u, y in samples.pairs]):
+        return None, False
+    found = samples.tried(1)
+    if found is None or not found.evidence.refined:
+        return found, False
+    evidence, level = found.evidence, found.offsets.constants[0]
+    A, C = evidence.model.A, evidence.model.C
+    lasting = linalg.block_diag(A, 1.0 - _DECAYS / evidence.longest)
+    seen = np.column_stack([C, level / evidence.output_scale])
+    try:
+        rivals = [samples.near(found, A, C, 0), samples.near(found, lasting, seen, 0)]
+    except TooFewSamples:
+        return found, False
+    best = min(rivals, key=lambda rival: rival.worse_than(found))
+    without = best.evidence.one_step
+    refuted = best.worse_than(found) > 0.0 and not stands_by_chance(without)
+    return found, refuted and constants_matter(without, evidence.one_step)
 
 
 def _drifts_off(samples: Samples, fitted: LocalFit, tested: Evidence) -> bool:

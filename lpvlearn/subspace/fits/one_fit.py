@@ -150,32 +150,42 @@ class Samples(NamedTuple):
         constants: unless these tell nothing of other orders, one of them must be
         promising, or one of a state less that begins at its own subspace.
         """
-        evidence, horizon = fitted.evidence, fitted.selection.horizon
+        evidence = fitted.evidence
         others = without_slow_modes(evidence)
         if others is None or not evidence.refined:
             return True
-        free = evidence.free._replace(n_trend=n_trend)
-        same = self.aside("collinear").having(horizon=horizon, refine="prediction")
-        same = same.having(method=fitted.method)
-
-        def near(A: Array, C: Array) -> LocalFit:
-            model = evidence.model._replace(A=A, C=C, blocks=None)
-            start = fitted._replace(
-                evidence=replace(evidence, model=model, free=free),
-                selection=Selection(len(A), horizon, []),
-                residual=np.inf,  # whatever comes of it
-            )
-            return same.having(order=len(A)).fit(n_trend, start)
-
+        own = evidence.model.A, evidence.model.C
         try:
-            own = evidence.model.A, evidence.model.C
-            if any(promising(near(A, C)) for A, C in [own, *others]):
-                return True
+            for A, C in [own, *others]:
+                if promising(self.near(fitted, A, C, n_trend)):
+                    return True
             lower = len(evidence.model.A) - 1
-            anew = same.having(order=lower)
+            anew = self._like(fitted).having(order=lower)
             return lower > 0 and promising(anew.fit(n_trend, fitted))
         except TooFewSamples:  # for that horizon
             return True
+
+    def near(self, fitted: LocalFit, A: Array, C: Array, n_trend: int) -> LocalFit:
+        """The model with other trends that few steps from one with A and C lead to.
+
+        In the scale of the one `fitted`, of the same samples.
+        """
+        evidence = fitted.evidence
+        start = fitted._replace(
+            evidence=replace(
+                evidence,
+                model=evidence.model._replace(A=A, C=C, blocks=None),
+                free=evidence.free._replace(n_trend=n_trend),
+            ),
+            selection=Selection(len(A), fitted.selection.horizon, []),
+            residual=np.inf,  # whatever comes of it
+        )
+        return self._like(fitted).having(order=len(A)).fit(n_trend, start)
+
+    def _like(self, fitted: LocalFit) -> Samples:
+        """Choosing no other horizon or method than a fit did."""
+        chosen = self.having(horizon=fitted.selection.horizon, refine="prediction")
+        return chosen.having(method=fitted.method).aside("collinear")
 
     def errors_held_out(self, fitted: LocalFit) -> HeldOut:
         """Errors of a fit's like on parts held out."""
