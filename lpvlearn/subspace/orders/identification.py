@@ -245,7 +245,10 @@ def realize(
     stable = simulation_fit(stable_A, C, records, free)
     if stable_A is A or enforce:
         return stable
-    as_found = simulation_fit(A, C, records, free)
+    if sections is None:
+        as_found = simulation_fit(A, C, records, free)
+    else:
+        as_found = block_fit(sections.blocks, C @ sections.transform, records, free)
     n_values = sum(record.y.size for record in records)
     n_parameters = order * (len(records[0].u) + len(C) + len(records))
     limit = max(STABLE_LOSS, 1.0 + _BY_CHANCE * n_parameters / n_values)

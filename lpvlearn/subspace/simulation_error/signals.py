@@ -188,14 +188,7 @@ def signal_factors(
     Their places, and (n_records, k, n_signals) with the Gramians of the signals; None
     where they overflow. `driven` is (n_records, order, 1 + n_inputs).
     """
-    lengths = np.array([record.n_samples for record in records])
-    groups: list[list[int]] = []
-    for i in np.argsort(lengths, kind="stable").tolist():
-        n = int(lengths[i])
-        if not groups or n > _SHORT or (len(groups[-1]) + 1) * n > _PIECE:
-            groups.append([])
-        groups[-1].append(i)
-    for group in groups:
+    for group in _like_ones(records):
         some = [records[i] for i in group]
         own = None if driven is None else driven[group]
         if len(group) > 1:
@@ -203,6 +196,20 @@ def signal_factors(
         else:
             R = signal_factor(blocks, some[0], None if own is None else own[0])
             yield np.array(group), None if R is None else R[None]
+
+
+def _like_ones(records: Sequence[Record]) -> list[list[int]]:
+    """Places of the records, those of short ones of like length together."""
+    if len(records) == 1:
+        return [[0]]
+    lengths = np.array([record.n_samples for record in records])
+    groups: list[list[int]] = []
+    for i in np.argsort(lengths, kind="stable").tolist():
+        n = int(lengths[i])
+        if not groups or n > _SHORT or (len(groups[-1]) + 1) * n > _PIECE:
+            groups.append([])
+        groups[-1].append(i)
+    return groups
 
 
 def _short_factors(

@@ -467,8 +467,9 @@ def linearised(
     """
     assert model.blocks is not None
     factors = signal_factors if signals is None else signals.factors
-    B = np.broadcast_to(model.B, (len(records), *model.B.shape))
-    driven = np.concatenate([model.initial_states[:, :, None], B], axis=2)
+    n, m = model.B.shape
+    driven = np.empty((len(records), n, 1 + m))
+    driven[:, :, 0], driven[:, :, 1:] = model.initial_states, model.B
     parts: list[Array] = []
     for where, R in factors(model.blocks, records, driven):
         if R is None:
