@@ -70,6 +70,9 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     refused = np.inf
     if auto and moves and not sure and may_matter():
         other = first or judged.fit(1, fitted)
+        if fitted.method == "pbsid" and other.worse_than(fitted) > 0.0:
+            # In a loop it can only be likelier, if it begins at the other as well.
+            other = judged.fit(1, fitted)
         order = len(fitted.model.A)
         if stands and len(other.model.A) > order:
             as_many, worse = judged.of_order(order, other, 1)
@@ -104,7 +107,7 @@ def _with_constants_first(samples: Samples) -> tuple[LocalFit | None, bool]:
     if not stays_far([Record.of(u, y) for u, y in samples.pairs]):
         return None, False
     found = samples.tried(1)
-    if found is None or not found.evidence.refined:
+    if found is None or not found.evidence.refined or found.method == "pbsid":
         return found, False
     evidence, level = found.evidence, found.offsets.constants[0]
     A, C = evidence.model.A, evidence.model.C
