@@ -390,7 +390,8 @@ def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
     start, N = Pairs.of(blocks)
     own = driven[..., start:, :].reshape(*several, len(N), 2, width)
     turned = N @ own
-    out[..., range(start), range(start), :] = driven[..., :start, :]
+    for i in range(start):
+        out[..., i, i, :] = driven[..., i, :]
     for k, row in enumerate(range(start, n, 2)):
         out[..., row : row + 2, row, :] = own[..., k, :, :]
         out[..., row : row + 2, row + 1, :] = turned[..., k, :, :]
