@@ -1039,3 +1039,15 @@ def test_poles_far_outside_leave_outputs_where_they_are():
     u = np.random.default_rng(0).standard_normal((50, 1))
     found = attributed(evidence, centres, [(u, u)])
     assert np.isfinite(found.outputs).all() and np.isfinite(found.constants).all()
+
+
+def test_signals_far_from_zero_are_chosen_for_with_their_constants(rng):
+    """As where these are asked for: none without them comes near."""
+    X, y = table(rng, levels=(50.0, 100.0), noise=0.1, u0=10.0)
+    found, asked = (
+        SubspaceLTI(experiment=2, sampling_time=1.0, offset=offset).fit(X, y)
+        for offset in ("auto", "constant")
+    )
+    assert found.offset_ == "constant"
+    assert found.selection_.equals(asked.selection_)
+    np.testing.assert_array_equal(found.lti_.A, asked.lti_.A)
