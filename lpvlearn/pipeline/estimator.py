@@ -73,7 +73,7 @@ from .one_basis.structured_models import (
     without_structure,
 )
 from .one_basis.together import through_black_boxes
-from .points.common_choices import common_delay, identify_points
+from .points.common_choices import common_delay, identify_points, of_structure
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.left_out import tell_of_two_points, tell_unforeseen
 from .points.local_models import (
@@ -837,8 +837,9 @@ list, default=None
         )
         estimator, whole = self._local(), points
         if self.offsets == "auto":
+            order = of_structure(estimator, structure)[0].get_params(deep=False)
             (local, kept), points, estimator = identified_as_held(
-                estimator, points, identify, runner
+                estimator, points, identify, runner, order.get("order", "auto")
             )
         else:
             local, kept = identify(estimator, points, runner)
@@ -883,9 +884,12 @@ list, default=None
         )
         knowing = clone(estimator)
         found: list[LocalModel] = []
+        # in pieces of records rates tell less than outputs do
+        whole = all(len({e.label for e in g}) == len(g) for g in points.experiments)
         with collected() as later, suppress(ValueError):
-            found, kept = identify(knowing.set_params(integrating=places))
-            if len(kept) < len(points) or self._are_poorer(found, local, points):
+            knowing.set_params(integrating=places)
+            found = identify(knowing)[0] if whole else []
+            if len(found) < len(points) or self._are_poorer(found, local, points):
                 found = []
         if not found:
             warn(

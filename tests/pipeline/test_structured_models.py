@@ -334,6 +334,16 @@ def test_integrators_without_a_structure_are_found():
 
 
 @pytest.mark.slow
+def test_integrators_of_records_in_pieces_are_told_only():
+    X, y, _ = headings(0)
+    lost = X.index.isin([200, 333, 900, 1500])
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    pipeline = LocalLPVPipeline(SubspaceLTI(missing="split"), **roles)
+    with pytest.warns(UserWarning, match="drifts off where that is not known"):
+        pipeline.fit(X[~lost], y[~lost])
+
+
+@pytest.mark.slow
 def test_a_structure_may_integrate_without_a_word():
     """No warning, and parameters within what is said of them."""
     X, y, true = headings(1)

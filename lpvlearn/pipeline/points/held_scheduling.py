@@ -47,7 +47,9 @@ _Identified: TypeAlias = "tuple[list[LocalModel], OperatingPoints]"
 # Share of the outputs' motion that is worth it, and what it leaves of one that is the
 # scheduling variable itself; steps from sample to sample, as a share of the outputs'
 # and of its own size, from which it is not slow; and what slopes of points may add.
-_SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.2, 0.1, 0.5, 0.5
+_SLIGHT, _OWN, _FAST, _NOISY, _ADDED = 0.005, 0.2, 0.1, 0.2, 0.5
+
+_ENOUGH = 3000  # samples that tell the curve of a point
 
 _MOST = 1_000_000  # samples, of tables that may lie on a disk
 
@@ -57,13 +59,14 @@ def identified_as_held(
     points: OperatingPoints,
     identify: Callable[[Any, OperatingPoints, PointRunner], _Identified],
     runner: PointRunner,
+    order: Any = "auto",
 ) -> tuple[_Identified, OperatingPoints, Any]:
     """Models of the points that did not fail, all points, and the estimator of both.
 
     As if nothing had scheduled within these, where the models are likelier so. Then all
-    of them have constants.
+    of them have constants. `order` is that of the models, where it is known.
     """
-    still = _held(points, runner)
+    still = _held(points, runner, order)
     if still is None:
         return identify(local, points, runner), points, local
     ways = [local]
@@ -101,7 +104,9 @@ def tell_of_held(names: Sequence[Hashable]) -> None:
     )
 
 
-def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | None:
+def _held(
+    points: OperatingPoints, runner: PointRunner, order: Any = "auto"
+) -> OperatingPoints | None:
     """The points without what their outputs do as scheduling variables move.
 
     None where that is nothing, or cannot be told.
@@ -110,6 +115,9 @@ def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | Non
     n_samples = sum(len(run.rows) for run in runs)
     if len(points) == 1 or not points.moved.any() or n_samples > _MOST:
         return None
+    paths = [_about_mean(run.kappa) for run in runs]
+    if not (_step(paths) < _NOISY * np.sqrt(_square(paths) / n_samples)).any():
+        return None  # what moves there is noise, or as fast as that
     sizes = channel_sizes(points.experiments)
     means = [tuple(mean for mean, _ in motions(g)) for g in points.experiments]
     levels, outputs = (np.array(values) for values in zip(*means, strict=True))
@@ -122,8 +130,9 @@ def _held(points: OperatingPoints, runner: PointRunner) -> OperatingPoints | Non
     known = replace(runner, verbose=0).run(
         "curves at rest",
         curve_at_rest,
-        [(group,) for group in points.experiments],
+        [(_farthest_moved(group),) for group in points.experiments],
         points.kappa,
+        order=order,
     )
     curves = [done.result for done in known if done is not None]
     changes = _changes(points, bends, curves, sizes[1])
@@ -186,6 +195,16 @@ def _without(run: Experiment, change: Array) -> Experiment:
     return replace(run, outputs=run.measured - change, scheduling=still)
 
 
+def _farthest_moved(group: Sequence[Experiment]) -> list[Experiment]:
+    """Those of which scheduling variables move most, of enough samples together."""
+    moved = [float(np.square(_about_mean(run.kappa)).sum()) for run in group]
+    chosen: list[Experiment] = []
+    for k in np.argsort(moved, kind="stable")[::-1].tolist():
+        if sum(len(run.rows) for run in chosen) < _ENOUGH:
+            chosen.append(group[k])
+    return chosen
+
+
 class Curve(NamedTuple):
     """Outputs at rest over the scheduling variables about a point."""
 
@@ -194,10 +213,10 @@ class Curve(NamedTuple):
     variances: Array  # likewise, of the slopes; infinite where these are not told
 
 
-def curve_at_rest(group: Sequence[Experiment]) -> Curve:
+def curve_at_rest(group: Sequence[Experiment], order: Any = "auto") -> Curve:
     """That of one point: static gains from scheduling variables and their squares.
 
-    Squares where the model is likelier with them.
+    Of a model of that order; squares where it is likelier with them.
     """
     kappa = [_about_mean(run.kappa) for run in group]
     moves = np.asarray(np.vstack(kappa).any(axis=0))
@@ -215,7 +234,7 @@ def curve_at_rest(group: Sequence[Experiment]) -> Curve:
         *inputs, label = table.columns
         roles = {"inputs": inputs, "experiment": label, "missing": "split"}
         with collected(), suppress(ValueError):
-            found = SubspaceLTI(offset="constant", **roles).fit(table, y)
+            found = SubspaceLTI(order, offset="constant", **roles).fit(table, y)
             std = found.frequency_response_std(np.zeros(1))[0].real
             longest = max(len(run.rows) for run in group)
             lasts = spectral_radius(found.lti_.A) > 1.0 - 1.0 / longest

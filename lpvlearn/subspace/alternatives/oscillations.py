@@ -106,8 +106,9 @@ def without_oscillations(
             samples.telling.once(
                 "oscillation",
                 f"{seen}Inputs step every {clock} samples, and a plant that is not "
-                "linear does so at each step: that was taken out. Use smaller inputs, "
-                "or steps that are not all of one length.",
+                "linear does so at each step; or it is a disturbance of that clock. It "
+                "was taken out. Use smaller inputs, and steps that are not all of one "
+                "length, or remove the disturbance at its source.",
             )
         else:
             samples.telling.once(

@@ -184,12 +184,16 @@ def _accepted(
 def _within(block: Array, radius: float, farthest: float) -> Array:
     """A block of A, a pole that integrates taken back to a radius: others may move on.
 
-    It is as it was where poles oscillate, or are beyond the `farthest`.
+    It is as it was where poles oscillate, are beyond the `farthest`, or both integrate:
+    at one place they have no section form.
     """
     if block_radius([block]) <= radius:
         return block
     poles, V = np.linalg.eig(block)
-    if np.iscomplexobj(poles) or np.abs(poles).max() > farthest:
+    if np.iscomplexobj(poles):
+        return block
+    both = len(poles) == 2 and poles.min() > 2.0 * radius - farthest
+    if both or np.abs(poles).max() > farthest:
         return block
     return np.asarray(V * np.clip(poles, -radius, radius) @ np.linalg.pinv(V))
 
