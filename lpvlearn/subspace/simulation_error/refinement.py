@@ -138,15 +138,14 @@ def _refined(
         improved = _accepted(model, records, free, steps)
         if improved is None:
             return model
-        trial, better = improved
+        trial, better, clipped = improved
         gain = model.loss - better.loss
         if patient:
             damping = _next_damping(trial.damping, gain / trial.promised)
         miss = predicted - gain
         model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
-        at_edge = abs(block_radius(model.blocks or ()) - _STABLE_RADIUS) < _ROUNDED
-        if left <= negligible or (at_edge and gain <= negligible):
+        if left <= negligible or (clipped and gain <= negligible):
             return model
     return model
 
@@ -164,20 +163,23 @@ def _accepted(
     records: Sequence[Record],
     free: Freedom,
     trials: Iterable[_Trial],
-) -> tuple[_Trial, Realization] | None:
-    """The first of ever shorter steps that reduces the error, and its model."""
-    radius = block_radius(model.blocks or ())
-    apart = 1.0 / max(record.n_samples for record in records)
-    # what grows over a record may grow faster; what hardly does may be an integrator
-    radius = max(_STABLE_RADIUS, radius + apart if radius > 1.0 + apart else radius)
+) -> tuple[_Trial, Realization, bool] | None:
+    """The first of ever shorter steps that reduces the error, and its model.
+
+    And whether that was kept from growing, and gains less than was promised.
+    """
+    # beside a constant alone an integrator is worth that
+    apart = bool(free.n_trend) / max(record.n_samples for record in records)
+    radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
     for trial in trials:
         moved = moved_model(model, trial.step, free)
         blocks = tuple(_within(b, radius, radius + apart) for b in moved.blocks or ())
         if block_radius(blocks) > radius + _ROUNDED:
             continue
+        clipped = block_radius(moved.blocks or ()) > radius + _ROUNDED
         found = block_fit(blocks, moved.C, records, free)
         if found.loss < model.loss:
-            return trial, found
+            return trial, found, clipped
     return None
 
 
