@@ -837,9 +837,9 @@ list, default=None
         )
         estimator, whole = self._local(), points
         if self.offsets == "auto":
-            order = of_structure(estimator, structure)[0].get_params(deep=False)
+            known = of_structure(estimator, structure)[0].get_params(deep=False)
             (local, kept), points, estimator = identified_as_held(
-                estimator, points, identify, runner, order.get("order", "auto")
+                estimator, points, identify, runner, known.get("order", "auto")
             )
         else:
             local, kept = identify(estimator, points, runner)
@@ -911,7 +911,6 @@ list, default=None
         points: OperatingPoints,
     ) -> bool:
         """Whether models leave more of the local experiments than other ones."""
-
         measured = [Measured.of(group) for group in points.experiments]
 
         def error(models: Sequence[LocalModel]) -> float:

@@ -7,11 +7,7 @@ import pandas as pd
 import pytest
 from joblib import Memory
 
-from lpvlearn import (
-    GrayBoxRestructurer,
-    GrayBoxStructure,
-    LocalLPVPipeline,
-)
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
 from lpvlearn.data.experiments import read_experiments
 from lpvlearn.data.operating_points import local_experiments
 from lpvlearn.pipeline.points.held_scheduling import _held, curve_at_rest
@@ -110,9 +106,7 @@ def test_held_experiments_lack_only_what_the_scheduling_moved():
     X, y = discharged()
     points = points_of(X, y)
     for before, after in zip(
-        points.experiments,
-        _held(points, RUNNER).experiments,
-        strict=True,
+        points.experiments, _held(points, RUNNER).experiments, strict=True
     ):
         (run,), (held,) = before, after
         moved = at_rest(run.kappa) - at_rest(run.kappa).mean()

@@ -173,10 +173,12 @@ def _accepted(
     radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
     for trial in trials:
         moved = moved_model(model, trial.step, free)
-        blocks = tuple(_within(b, radius, radius + apart) for b in moved.blocks or ())
-        if block_radius(blocks) > radius + _ROUNDED:
-            continue
-        clipped = block_radius(moved.blocks or ()) > radius + _ROUNDED
+        blocks = moved.blocks or ()
+        clipped = block_radius(blocks) > radius + _ROUNDED
+        if clipped:
+            blocks = tuple(_within(b, radius, radius + apart) for b in blocks)
+            if block_radius(blocks) > radius + _ROUNDED:
+                continue
         found = block_fit(blocks, moved.C, records, free)
         if found.loss < model.loss:
             return trial, found, clipped
