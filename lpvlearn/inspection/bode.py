@@ -355,7 +355,7 @@ class BodeDisplay:
         )
         for j, name in enumerate(inputs):
             if len(inputs) > 1 or self.units:
-                axes[0, j].set_title(f"from {name}", fontsize=9)
+                axes[0, j].set_title(f"from {name}", fontsize=9, y=1.0)
             axes[-1, j].set_xlabel(self.frequency_label)
         for i, name in enumerate(outputs):
             several = len(outputs) > 1 or len(inputs) > 1 or self.units

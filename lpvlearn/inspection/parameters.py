@@ -455,7 +455,7 @@ class ParameterDisplay:
 
         tidy(ax)
         title = with_unit(name, units_of([name], self.units)[0])
-        ax.set_title(title, fontsize=9, pad=3)
+        ax.set_title(title, fontsize=9, pad=3, y=1.0)  # or a place is looked for
         ax.xaxis.set_major_locator(MaxNLocator(4))
         ax.yaxis.set_major_locator(MaxNLocator(4))
         if lowest:
