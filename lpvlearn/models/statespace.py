@@ -796,6 +796,17 @@ def _balancings(what: str, models: Sequence[StateSpace]) -> list[Balancing]:
     return balancing_transformations(A, B, C, not models[0].is_continuous)
 
 
+def forgetting(model: StateSpace, rate: float) -> StateSpace:
+    """The model ``A - rate I``, in any basis: its response at ``j omega + rate``.
+
+    In continuous time.
+    """
+    if not rate:
+        return model
+    A = model.A - rate * np.eye(model.order)
+    return model._of(A, model.B, model.C, model.D, None, model.input_delay)
+
+
 def with_free_states(model: StateSpace, A: Array, C: Array) -> StateSpace:
     """The model with further states that no input moves, after its own."""
     B = np.vstack([model.B, np.zeros((len(A), model.n_inputs))])

@@ -75,12 +75,13 @@ from .one_basis.structured_models import (
 from .one_basis.together import through_black_boxes
 from .points.common_choices import common_delay, identify_points, of_structure
 from .points.held_scheduling import identified_as_held, tell_of_held
+from .points.integrators import integrated
 from .points.left_out import tell_of_two_points, tell_unforeseen
 from .points.local_models import (
+    Integrates,
     LocalModel,
     channel_sizes,
     estimates_outputs,
-    integrating_outputs,
     is_left,
 )
 from .points.mislabelled import tell_of_mislabelled, tell_of_wrong_values
@@ -88,7 +89,7 @@ from .refining.coefficients import known_coefficients, local_covariance, refine_
 from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along
 from .reports.html_report import html_report
-from .reports.tables import Measured, Summary, Tables, fit_of, summarise, tables
+from .reports.tables import Summary, Tables, summarise, tables
 from .running.memory import checked_memory
 from .running.runner import PointRunner
 from .running.workers import check_jobs
@@ -103,7 +104,6 @@ _DEFAULTS = {
     "interpolator": AutoLPV,
 }
 
-_POORER = 1.1  # of squared errors: those of models that know of integrators
 _PATIENCE = 2.0  # seconds after which one asks oneself what is going on
 
 
@@ -835,92 +835,56 @@ list, default=None
             efficient=self.efficient or efficient,
             deviate=self._needs_deviations(),
         )
-        estimator, whole = self._local(), points
-        if self.offsets == "auto":
-            known = of_structure(estimator, structure)[0].get_params(deep=False)
-            (local, kept), points, estimator = identified_as_held(
-                estimator, points, identify, runner, known.get("order", "auto")
-            )
-        else:
-            local, kept = identify(estimator, points, runner)
+        whole, estimator = points, self._local()
+        given = of_structure(estimator, structure)[0].get_params(deep=False)
+
+        def as_held(identify: Any) -> Any:
+            if self.offsets != "auto":
+                return identify(estimator, whole, runner), whole, estimator
+            order = given.get("order", "auto")
+            return identified_as_held(estimator, whole, identify, runner, order)
+
+        black_boxes, refused = self.restructurer in (None, "aligned"), None
+        try:
+            (local, kept), points, estimator = as_held(identify)
+        except ValueError as error:
+            if not (black_boxes and isinstance(error.__cause__, Integrates)):
+                raise
+            refused = error
+            identify = partial(identify, n_at_zero=2 * self.n_outputs_)
+            try:
+                with collected():
+                    (local, kept), points, estimator = as_held(identify)
+            except ValueError:
+                raise refused from None
         longest = self.sampling_time_ * kept.n_longest
         channels = first.input_names, self.output_names_
         wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
-        if self.restructurer in (None, "aligned") and not wrong:
+        if black_boxes and not wrong:
             quiet = replace(runner, verbose=0)
             again = partial(identify, points=kept, runner=quiet)
-            estimator, local = self._integrated(estimator, local, kept, again, told)
+            estimator, local = integrated(
+                estimator,
+                local,
+                kept,
+                again,
+                sampling_time=self.sampling_time_,
+                output_names=self.output_names_,
+                told=told,
+                growing=refused is not None,
+            )
             said = len(told)
             order = _foreseen_order(estimator, local, kept, longest, again)
             if order is not None:
                 del told[:said]  # of the models of more states
                 estimator = clone(estimator).set_params(order=order)
                 local, kept = identify(estimator, points, runner)
+        if refused is not None and not local[0].integrating:
+            raise refused
         take_back(LINE)  # the LPV model rests where it begins
         if points is not whole:
             tell_of_held(first.scheduling_names)
         return local, kept
-
-    def _integrated(
-        self,
-        estimator: Any,
-        local: list[LocalModel],
-        points: OperatingPoints,
-        identify: Callable[..., tuple[list[LocalModel], OperatingPoints]],
-        told: list[Told],
-    ) -> tuple[Any, list[LocalModel]]:
-        """An estimator that knows which outputs integrate, and its models.
-
-        Without a structure the rate of an integrator may jump with the scheduling
-        variable, and the integrator keeps that.
-        """
-        places = integrating_outputs(local, self.sampling_time_ * points.n_longest)
-        if not places:
-            return estimator, local
-        names = [self.output_names_[k] for k in places]
-        what = (
-            f"outputs {names} integrate at all operating points, as a position does: "
-            "their local models have a pole that does not decay over the record. "
-        )
-        knowing = clone(estimator)
-        found: list[LocalModel] = []
-        # in pieces of records rates tell less than outputs do
-        whole = all(len({e.label for e in g}) == len(g) for g in points.experiments)
-        with collected() as later, suppress(ValueError):
-            knowing.set_params(integrating=places)
-            found = identify(knowing)[0] if whole else []
-            if len(found) < len(points) or self._are_poorer(found, local, points):
-                found = []
-        if not found:
-            warn(
-                f"{what}Without a structure an LPV model drifts off where that is not "
-                f"known. Use local=SubspaceLTI(integrating={names})."
-            )
-            return estimator, local
-        told[:] = later
-        warn(
-            f"{what}They were identified by their rates, and integrated. Use "
-            f"local=SubspaceLTI(integrating={names}) to say so."
-        )
-        return knowing, found
-
-    def _are_poorer(
-        self,
-        found: Sequence[LocalModel],
-        others: Sequence[LocalModel],
-        points: OperatingPoints,
-    ) -> bool:
-        """Whether models leave more of the local experiments than other ones."""
-        measured = [Measured.of(group) for group in points.experiments]
-
-        def error(models: Sequence[LocalModel]) -> float:
-            fits = [
-                fit_of(m.lti, known, self.sampling_time_, m.n_trend, m.hold)
-                for m, known in zip(models, measured, strict=True)
-            ]
-            return float(np.sum((100.0 - np.array(fits)) ** 2))
-
-        return not error(found) < _POORER * error(others)
 
     def _tell_between(
         self, found: StructuredModels, longest: float, moving: bool

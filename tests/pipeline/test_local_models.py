@@ -20,7 +20,6 @@ from lpvlearn.pipeline.points import local_models
 from lpvlearn.pipeline.points.local_models import (
     LocalModel,
     identify_point,
-    integrating_outputs,
 )
 
 from ..conftest import ROLES
@@ -306,22 +305,6 @@ def test_states_of_the_noise_are_none_of_the_plant(method, cheapest):
     costs = local_models._costs(Fitted(), [run])
     assert min(costs, key=costs.__getitem__) == cheapest
     assert costs[cheapest - 1] == 9.0 and min(costs) == 0
-
-
-@pytest.mark.parametrize(
-    "poles, places",
-    [
-        ((-1e-6, -2e-6), [0]),
-        ((-1e-6, 0.0), [0]),
-        ((-1e-6, -0.01), []),  # at one point it decays
-    ],
-)
-def test_outputs_that_integrate_do_so_at_all_points(poles, places):
-    local = [
-        LocalModel(StateSpace(np.diag([pole, -1.0]), [[1.0], [1.0]], np.eye(2)), 2, 5)
-        for pole in poles
-    ]
-    assert integrating_outputs(local, 100.0) == places
 
 
 def test_an_average_knows_no_units_and_turns_states_of_equal_singular_values():

@@ -308,52 +308,6 @@ def test_nothing_is_said_of_distances_between_integrators():
     assert "through the local models" not in text and "nan" not in text
 
 
-SHIP = GrayBoxStructure.from_template([[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0]])
-
-
-def headings(seed):
-    """A ship's at three speeds, with a biased rudder, and its parameters there."""
-    runs, true, rng = [], [], np.random.default_rng(seed)
-    for speed in (4.0, 6.0, 8.0):
-        true.append([0.01 * speed, 0.0012 * speed**2])
-        u = np.repeat(rng.choice([-10.0, 10.0], 30), 20) + rng.normal(0.0, 2.0, 600)
-        y = SHIP.model(true[-1]).simulate(u - u.mean(), sampling_time=1.0)
-        y += 90.0 + 0.005 * y.std() * rng.standard_normal(y.shape)
-        runs.append((u - u.mean() + 1.0, speed, y))
-    return *from_trajectories(runs, sampling_time=1.0), true
-
-
-@pytest.mark.slow
-def test_integrators_without_a_structure_are_found():
-    """They jumped with the speed, and the integrator kept that: fits of -90 to 95 %."""
-    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
-    with pytest.warns(UserWarning, match="identified by their rates, and integrated"):
-        model = LocalLPVPipeline(**roles).fit(*headings(0)[:2])
-    for seed in (0, 1, 2):
-        assert model.score(*headings(seed)[:2]) > 0.998
-
-
-@pytest.mark.slow
-def test_integrators_of_records_in_pieces_are_told_only():
-    X, y, _ = headings(0)
-    lost = X.index.isin([200, 333, 900, 1500])
-    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
-    pipeline = LocalLPVPipeline(SubspaceLTI(missing="split"), **roles)
-    with pytest.warns(UserWarning, match="drifts off where that is not known"):
-        pipeline.fit(X[~lost], y[~lost])
-
-
-@pytest.mark.slow
-def test_a_structure_may_integrate_without_a_word():
-    """No warning, and parameters within what is said of them."""
-    X, y, true = headings(1)
-    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
-    model = LocalLPVPipeline(restructurer=GrayBoxRestructurer(SHIP), **roles).fit(X, y)
-    off = (model.parameters_ - np.array(true)) / model.parameters_std_
-    assert off.abs().to_numpy().max() < 3.5
-    assert (model.parameters_std_ / np.array(true) < 3e-3).all(axis=None)
-
-
 def test_undamped_oscillators_are_weighed_by_their_uncertainty():
     """Identified pairs lie beside the axis; the residues tell what explains them."""
     structure = GrayBoxStructure.from_template(

@@ -23,7 +23,7 @@ from ...lpv.alignment import (
     spanning_tree,
 )
 from ...lpv.spline import SplineLPV
-from ...models.statespace import StateSpace, scaled, with_signs_of
+from ...models.statespace import StateSpace, forgetting, scaled, with_signs_of
 from ...structures.structure import GrayBoxStructure
 from ...validation import listed
 from ..points.left_out import (
@@ -31,7 +31,6 @@ from ..points.left_out import (
     UNLIKE,
     changed,
     errors_left_out,
-    forgetting,
     forgotten,
     largest_difference,
 )

@@ -22,7 +22,7 @@ from ...lpv.polynomial import PolynomialLPV
 from ...lpv.rational import RationalLPV
 from ...lpv.spline import SplineLPV
 from ...lpv.weighting import noise_explains
-from ...models.statespace import DEVIATION, StateSpace, scaled
+from ...models.statespace import DEVIATION, StateSpace, forgetting, scaled
 from ...restructuring.coordinates import CanonicalForm
 from ...structures.structure import GrayBoxStructure
 from ...structures.templates import generic_indices
@@ -31,7 +31,6 @@ from ..checks.stability import holds_within_range
 from ..points.left_out import (
     UNLIKE,
     errors_left_out,
-    forgetting,
     forgotten,
     largest_difference,
 )

@@ -16,7 +16,7 @@ from ...exceptions import warn
 from ...lpv.left_out import values_left_out
 from ...lpv.model import LPVStateSpace
 from ...lpv.spline import SplineLPV
-from ...models.statespace import StateSpace
+from ...models.statespace import StateSpace, forgetting
 from ...restructuring.error_system import frequency_grid
 from ...structures.structure import GrayBoxStructure
 from ...validation import listed
@@ -222,15 +222,6 @@ def forgotten(models: Sequence[StateSpace], longest: float) -> float:
     rate = _HARDLY / longest
     slowest = max(model.poles().real.max(initial=-np.inf) for model in models)
     return rate if slowest > -rate else 0.0
-
-
-def forgetting(model: StateSpace, rate: float) -> StateSpace:
-    """The model ``A - rate I``, in any basis: its response at ``j omega + rate``."""
-    if not rate:
-        return model
-    A = model.A - rate * np.eye(model.order)
-    matrices = A, model.B, model.C, model.D
-    return StateSpace(*matrices, model.sampling_time, input_delay=model.input_delay)
 
 
 def changed(one: StateSpace, other: StateSpace, longest: float) -> float:

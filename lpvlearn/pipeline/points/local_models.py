@@ -22,6 +22,7 @@ from ...models.statespace import (
     ModelPair,
     StateSpace,
     balanced_models,
+    forgetting,
     scaled,
 )
 from ...restructuring.minimise_covariance import Estimate
@@ -47,9 +48,14 @@ _APART = 0.1
 # more than that part of the output that does most.
 _STANDING = 0.05
 
-# One that much slower may be an integrator, known by samples that are not many; the
-# share by which it may decay in a record.
-_ABOUT_ZERO, _HARDLY = 0.25, 0.05
+_ABOUT_ZERO = 0.25  # of the others: it may be one, known by samples that are not many
+_TWICE = (  # of models of rates, on top of what else may be done
+    "Where rates integrate as well, as the velocity of what nothing holds, have a "
+    "structure say so: restructurer=GrayBoxRestructurer(structure) with zeros in its "
+    "A. Else try "
+)
+_NOTHING = 1e-6  # share by which what does not decay, to rounding, may do so or grow
+HARDLY = 0.05  # share by which an integrator may decay, or grow, in a record
 _GROWN = 3.0  # time constants per record, up to which one that grows may be one
 
 # States that a disturbance may have beside those of a structure: two resonances, or a
@@ -185,10 +191,14 @@ def _pooled(
         if about_zero.are_all_that_last(lti.poles()):
             for kind in OF_LASTING:
                 take_back(kind)
-    else:  # stable but for the integrators
-        _continuous(rates.lti_, discretization, advice, AboutZero())
+    else:  # stable but for the integrators, of which an output may have two
+        twice = AboutZero(rates.lti_.n_outputs, HARDLY * about_zero.rate)
+        growth = _continuous(rates.lti_, discretization, _TWICE, twice).poles().real
         with collected():  # said of the rates
             lti = fitted.lti_.to_continuous(discretization)
+        if growth.max(initial=-np.inf) >= 0.0:
+            slower = growth.max() + _NOTHING * about_zero.rate
+            lti = _with_slower_rates(lti, len(_integrating(fitted)), slower)
     found = LocalModel(
         lti,
         **_told_by(fitted, experiments),
@@ -715,6 +725,10 @@ def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> str:
     )
 
 
+class Integrates(ValueError):
+    """A local model is refused, for poles about zero: outputs may integrate."""
+
+
 class AboutZero(NamedTuple):
     """Poles that are known to be at zero: their number, and how near estimates are."""
 
@@ -739,15 +753,20 @@ def _continuous(
 ) -> StateSpace:
     with collected():  # said below
         lti = model.to_continuous(discretization)
-    if not lti.is_stable and (about_zero.others(lti.poles()).real >= 0.0).any():
+    growth = about_zero.others(lti.poles()).real.max(initial=-np.inf)
+    if 0.0 <= growth <= _NOTHING * about_zero.rate:
+        lti = forgetting(lti, 2.0 * _NOTHING * about_zero.rate)
+    elif growth > 0.0:
         worst = lti.poles()[np.argmax(lti.poles().real)]
-        advice = _integrating_outputs(lti, _GROWN * about_zero.rate) + advice
-        raise ValueError(
-            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
+        named = _integrating_outputs(lti, _GROWN * about_zero.rate)
+        raise (Integrates if named else ValueError)(
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. "
+            f"{named}{advice}"
             "local=SubspaceLTI(offset='linear') if the outputs drift, "
             "stability='enforce', another `order`, a longer `horizon` or more data, or "
             "leave the point out by on_error='skip'."
         )
+    take_back("border")
     if lti.order > model.order:
         poles = _alternating(model)
         warn(
@@ -761,38 +780,34 @@ def _continuous(
     return lti
 
 
-def _integrating_places(lti: StateSpace, rate: float) -> list[int]:
-    """Which outputs integrate, where the only slow pole is about zero.
+def _with_slower_rates(lti: StateSpace, n_integrators: int, rate: float) -> StateSpace:
+    """A model whose poles are that much (1/s) lower, but for so many at zero.
 
-    Nearer to it than all others, and than a `rate`, 1/s. It is that of the outputs that
-    show it.
+    With ``A v = 0`` for as many directions as before.
     """
-    if not lti.order:
-        return []
+    kept = np.linalg.svd(lti.A)[2][: lti.order - n_integrators]
+    return lti._of(lti.A - rate * kept.T @ kept, lti.B, lti.C, lti.D)
+
+
+def integrating_places(lti: StateSpace, rate: float) -> list[int]:
+    """Which outputs integrate, where slow poles are about zero: within a `rate`, 1/s.
+
+    And nearer to it than all others. They are those of the outputs that show them, two
+    of one that integrates twice.
+    """
     poles, V = np.linalg.eig(lti.A)
-    i = int(np.argmax(poles.real))
-    least = min(_ABOUT_ZERO * np.delete(np.abs(poles), i).min(initial=np.inf), rate)
-    if poles[i].imag or abs(poles[i]) > least:
+    slow = np.abs(poles) <= rate
+    others = np.abs(poles[~slow]).min(initial=np.inf)
+    if not slow.any() or np.abs(poles[slow]).max() > _ABOUT_ZERO * others:
         return []
-    seen = np.abs(lti.C @ V[:, i].real)
+    size = np.linalg.norm(lti.C, axis=1)  # of outputs in any unit
+    seen = np.linalg.norm(lti.C @ V[:, slow], axis=1) / np.where(size > 0.0, size, 1.0)
     return np.flatnonzero(seen > _STANDING * seen.max()).tolist()
-
-
-def integrating_outputs(local: Sequence[LocalModel], longest: float) -> list[int]:
-    """Places of outputs that integrate at all points, though nobody said so.
-
-    By a pole that does not decay by more than next to nothing in the `longest` record
-    (seconds).
-    """
-    found = [_integrating_places(model.lti, _HARDLY / longest) for model in local]
-    if any(model.integrating for model in local) or not all(found):
-        return []
-    return sorted(set.intersection(*map(set, found)))
 
 
 def _integrating_outputs(lti: StateSpace, rate: float) -> str:
     """What to do about outputs that integrate, if there are any, up to a `rate`."""
-    places = _integrating_places(lti, rate)
+    places = integrating_places(lti, rate)
     if not places:
         return ""
     return (

@@ -19,8 +19,9 @@ from ...exceptions import warn
 from ...lpv.polynomial import PolynomialLPV
 from ...lpv.weighting import noise_explains
 from ...models.scheduling_range import in_range_of_points
+from ...models.statespace import forgetting
 from ..running.runner import place_of
-from .left_out import forgetting, forgotten
+from .left_out import forgotten
 from .local_models import LocalModel
 
 Array = NDArray[np.float64]

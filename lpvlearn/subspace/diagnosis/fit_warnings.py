@@ -563,9 +563,8 @@ def warn_about_pole(A: Array, telling: Telling, fitted: LocalFit | None = None) 
             "border",
             "The identified model is on the border of stability, by integrators or "
             f"undamped oscillations: {count} of its poles at modulus 1, to rounding. "
-            "Its outputs may grow without end, and no chain of local "
-            "models takes it. Name outputs that integrate in `integrating`; otherwise "
-            "use stability='enforce', or another `order`.",
+            "Its outputs may grow without end. Name outputs that integrate in "
+            "`integrating`; otherwise use stability='enforce', or another `order`.",
         )
 
 
