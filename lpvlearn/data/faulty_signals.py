@@ -45,7 +45,9 @@ _BEFORE, _AFTER = 0.05, 0.75
 
 # It is wrapped where it steps by this share of its range, so many times, no other step
 # is larger than this one, and that of its samples are neither near the top nor bottom.
+# Or so many times, of a range that is this part of a revolution at least.
 _REVOLUTION, _REVOLUTIONS, _OTHER_STEPS, _BETWEEN = 0.8, 3, 0.3, 0.3
+_ABOUT_NORTH, _WHOLE, _ROUNDED = 2, 0.9, 1e-3
 
 
 def far_out(signals: Array) -> NDArray[np.bool_]:
@@ -233,27 +235,49 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
 def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
     """Times that signals (n_samples,) turn back by a revolution, as angles do.
 
-    Not where an input (n_samples, n_inputs) jumps, at most two samples before.
+    Not where an input (n_samples, n_inputs) jumps, at most two samples before. About
+    north they are at both ends of their range: that is one of degrees or radians then,
+    and steps are small but for whole revolutions.
 
     >>> angle = np.mod(np.linspace(0.0, 50.0, 400), 2.0 * np.pi)
     >>> wraps([angle], [np.ones((400, 1))]), wraps([angle], [angle[:, None]])
     (7, 0)
+    >>> wraps([np.mod(20.0 * np.sin(angle), 360.0)], [np.ones((400, 1))])
+    15
     """
     y = np.concatenate(signals)
     low, width = y.min(), np.ptp(y)
-    steps = [np.abs(np.diff(signal)) for signal in signals]
-    turns = [step > _REVOLUTION * width for step in steps]
-    if sum(map(np.count_nonzero, turns)) < _REVOLUTIONS:  # the usual case
+    steps = [np.diff(signal) for signal in signals]
+    turns = [np.abs(step) > _REVOLUTION * width for step in steps]
+    if sum(map(np.count_nonzero, turns)) < _ABOUT_NORTH:  # the usual case
         return 0
-    others = (step[~far] for step, far in zip(steps, turns, strict=True))
+    others = (np.abs(step[~far]) for step, far in zip(steps, turns, strict=True))
     largest = max(step.max(initial=0.0) for step in others)
+    n_turns = _by_themselves(turns, inputs)
+    place = (y - low) / width
+    between = np.mean((place > 0.2) & (place < 0.8)) > _BETWEEN
+    if n_turns >= _REVOLUTIONS and largest < _OTHER_STEPS * width and between:
+        return n_turns
+    for period in (360.0, 2.0 * np.pi):
+        if not _WHOLE * period < width <= (1.0 + _ROUNDED) * period:
+            continue
+        turns = [np.abs(step) > 0.5 * period for step in steps]
+        left = [step - period * np.round(step / period) for step in steps]
+        n_turns = _by_themselves(turns, inputs)
+        small = np.abs(np.concatenate(left)).max(initial=0.0) < _OTHER_STEPS * period
+        if n_turns >= _ABOUT_NORTH and small:
+            return n_turns
+    return 0
+
+
+def _by_themselves(turns: Sequence[NDArray[np.bool_]], inputs: Sequence[Array]) -> int:
+    """Number of steps (n_samples - 1,) that follow no jump of an input."""
     widths = np.ptp(np.vstack(inputs), axis=0)
+    found = 0
     for moved, far in zip(inputs, turns, strict=True):
+        own = far.copy()
         jumps = (np.abs(np.diff(moved, axis=0)) > _OTHER_STEPS * widths).any(axis=1)
         for lag in range(3):  # which a plant may take
-            far[lag:] &= ~jumps[: max(len(jumps) - lag, 0)]
-    n_turns = sum(int(far.sum()) for far in turns)
-    place = (y - low) / (width or 1.0)
-    between = np.mean((place > 0.2) & (place < 0.8)) > _BETWEEN
-    found = n_turns >= _REVOLUTIONS and largest < _OTHER_STEPS * width and between
-    return n_turns if found else 0
+            own[lag:] &= ~jumps[: max(len(jumps) - lag, 0)]
+        found += int(own.sum())
+    return found

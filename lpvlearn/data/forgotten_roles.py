@@ -27,8 +27,8 @@ _EVEN, _JITTER = 0.05, 0.5
 _FEWEST = 10  # steps below which a few even ones are chance
 
 # Share of the steps that may go back, from experiment to experiment, or leave rows out;
-# and of those of an index that may do the latter.
-_RESTARTS, _TORN = 0.05, 0.05
+# and of those of an index that must not, for the others to be holes.
+_RESTARTS, _WHOLE = 0.05, 0.3
 
 _ALIKE = 100  # samples from which columns that agree to the bit are one
 
@@ -114,8 +114,9 @@ def refuse_outputs_among_inputs(
 def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
     """Warn of rows not in the order of their numbers or dates, the index, or torn.
 
-    Labels that stand twice (tables below each other) tell nothing. Numbers that go on
-    by the same step but in a few places tell that rows are missing there.
+    Labels that stand twice (tables below each other) tell nothing. Numbers that mostly
+    go on by the same step, and elsewhere by some of them, tell that rows are missing
+    there, unless the labels in between are those of other experiments.
     """
     index = getattr(X, "index", None)
     if not isinstance(index, pd.Index) or index.inferred_type not in _ORDERED:
@@ -134,10 +135,15 @@ def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
             )
             return
         if index.inferred_type == "integer" and len(labels) > _FEWEST:
-            steps = np.diff(labels.to_numpy().astype(np.float64))
-            typical = np.median(steps)
-            torn = np.flatnonzero(steps > typical)
-            if 0 < len(torn) <= _TORN * len(steps) and (steps >= typical).all():
+            numbers = labels.to_numpy().astype(np.float64)
+            steps = np.diff(numbers)
+            least = steps.min()
+            torn = np.flatnonzero(steps > least)
+            of_holes = len(steps) - len(torn) >= _WHOLE * len(steps)
+            if len(torn) and of_holes and not (steps % least).any():
+                next_ones = numbers[torn] + least
+                if index.isin(next_ones).sum() > len(torn) // 2:
+                    continue  # rows of experiments take turns
                 where = int(torn[0])
                 warn(
                     "Rows of X are missing within an experiment: its index goes from "

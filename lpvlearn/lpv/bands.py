@@ -74,6 +74,7 @@ def simulation_std(model: LPVStateSpace, u: Array, kappa: Array, dt: float) -> A
     return std
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of models that grow beyond all numbers
 def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels:
     """Noise and model error behind simulation errors (n_samples, n_outputs) of records.
 

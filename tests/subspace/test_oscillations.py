@@ -6,6 +6,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import StateSpace, SubspaceLTI, load, save
+from lpvlearn.subspace.alternatives.oscillations import _are_of_inputs
+from lpvlearn.subspace.samples.records import Record
 
 _TURN = 1.2341  # radians per sample
 
@@ -243,3 +245,14 @@ def test_modes_of_few_lines_give_way_to_those_that_decay(lines, seed):
     u, y = simulated(rng)
     error = (y - model.lti_.simulate(u))[200:]
     assert np.linalg.norm(error) < 0.15 * np.linalg.norm(y)
+
+
+def test_outputs_answer_at_lines_of_a_periodic_input():
+    """The fundamental of a pulse train was taken for a disturbance."""
+    rng, time = np.random.default_rng(0), np.arange(750)
+    pulses = (time % 31 == 0).astype(float)
+    fundamental, hum = 2.0 * np.pi / 31.0, 0.9
+    turns = np.array([fundamental, 3.0 * fundamental, hum])
+    for u, are in ((pulses, [True, True, False]), (rng.normal(size=750), [False] * 3)):
+        found = _are_of_inputs(turns, [Record.of(u[:, None], np.zeros((750, 1)))])
+        assert found.tolist() == are

@@ -50,6 +50,10 @@ _CHANCE = 1e-6  # of as large an oscillation of white noise
 
 _NEAR = 10.0  # per record: distance from a sinusoid of modes that do the same
 
+# Times the energy beside it that a line of the inputs has: so many bins away at most,
+# and further than these few, to which it spreads.
+_STANDS_OUT, _BESIDE, _WITHIN = 30.0, 8, 2
+
 _SHARP = 0.03  # decay per sample of modes of an autoregression that may stand for one
 
 # Independent values of the inputs for each parameter, below which these are of few
@@ -206,6 +210,7 @@ def _turns(evidence: Evidence) -> Array:
     records = evidence.whitening.records(evidence.records, free)
     n_samples = sum(record.n_samples for record in records)
     n_left = n_samples * len(model.C) - n_parameters(len(model.A), records, free)
+    turns = turns[~_are_of_inputs(turns, evidence.records)]
     if not (len(turns) and evidence.refined and n_left > 0):
         return turns[:0]
     fitted = _beside(turns, model, records, free, _DEGREE)
@@ -215,6 +220,27 @@ def _turns(evidence: Evidence) -> Array:
     steady = energy[:, 1:].sum(axis=1) < _WANDERS * energy[:, 0]
     by_chance = 2.0 * np.log(n_samples / _CHANCE) * fitted.loss / n_left
     return turns[steady & (energy[:, 0] > by_chance)]
+
+
+def _are_of_inputs(turns: Array, records: Sequence[Record]) -> NDArray[np.bool_]:
+    """Whether inputs have lines there, as periodic ones do: outputs answer at these.
+
+    Energies far above those of frequencies beside, and above what all have in the mean.
+    """
+    found = np.zeros(len(turns), dtype=bool)
+    for record in records:
+        bin_ = 2.0 * np.pi / record.n_samples
+        around = np.arange(-_BESIDE, _BESIDE + 1) * bin_
+        spectrum = np.exp(
+            -1j * np.arange(record.n_samples) * (turns + around[:, None])[..., None]
+        )
+        motion = record.u - record.u.mean(axis=1, keepdims=True)
+        energy = np.abs(spectrum @ motion.T) ** 2  # (n_around, n_turns, n_inputs)
+        beside = np.abs(around) > _WITHIN * bin_
+        line = energy[~beside].max(axis=0)
+        stands = line > _STANDS_OUT * energy[beside].mean(axis=0)
+        found |= (stands & (line > (motion**2).sum(axis=1))).any(axis=-1)
+    return found
 
 
 def _lasting_turns(model: Realization, longest: int, within: float = _DECAYS) -> Array:

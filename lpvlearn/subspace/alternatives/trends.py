@@ -53,10 +53,10 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     fitted = first if first and sure else judged.fit(n_trend, like)
     n_trend = fitted.evidence.free.n_trend
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
-    # so does one of a model that has to start at rest. In the errors of a poor model of
-    # a given order nothing stands out.
+    # so does one of a model that has to start at rest. In the errors of a poor model
+    # nothing stands out.
     hides = fitted.method == "pbsid" or not choices.initial_states
-    hides |= given and fitted.residual > _HARDLY
+    hides |= fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
     stands = auto and stands_by_chance(tested)
 

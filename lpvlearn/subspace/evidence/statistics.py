@@ -221,7 +221,9 @@ class Evidence:
         if not self.refined:
             raise ValueError(
                 "The covariance is that of a refined model at an unconstrained "
-                "minimum: refine='simulation' or 'prediction' and stability='warn'."
+                "minimum, which this one is not: refine='auto' leaves models as they "
+                "are that simulate parts held out better so. Use refine='simulation' "
+                "or 'prediction', and stability='warn'."
             )
         if self.sections.blocks is None:
             raise ValueError(
