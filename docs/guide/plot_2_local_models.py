@@ -184,7 +184,9 @@ for delay in (0, "auto"):
 # ``"delay_"`` by input. The points tell one delay together where that is as likely as
 # one of each; not with ``integrating``, nor where models of experiments are averaged,
 # where each finds its own. Where they differ beyond doubt, a warning lists them, and
-# ``lpv_`` takes the median.
+# ``lpv_`` takes the median. A local estimator that is left at its default has a delay
+# looked for, too, where models tell of one, and taken with a warning where all points
+# have the same; ``input_delay=[0]`` asks for none.
 #
 # .. _guide_offsets:
 #

@@ -76,6 +76,7 @@ from .one_basis.together import through_black_boxes
 from .points.common_choices import common_delay, identify_points, of_structure
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.integrators import integrated
+from .points.late_inputs import with_delays
 from .points.left_out import tell_of_two_points, tell_unforeseen
 from .points.local_models import (
     Integrates,
@@ -153,7 +154,9 @@ class LocalLPVPipeline(ScheduledEstimator):
         the noise, with a pole on the negative real axis; else one order for all points:
         that of most evidence, all their records together, or a lower one, with a
         warning, where points left out are foreseen by that alone. Without a structure
-        outputs that integrate at all points are found, with a warning that names them.
+        outputs that integrate at all points are found, with a warning that names them;
+        so are, where `local` is left at no delay, inputs that arrive late, by as many
+        samples at all points.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" interpolates the entries of
         the local models, each turned to its neighbour by the rotation that brings their
@@ -860,18 +863,16 @@ list, default=None
         longest = self.sampling_time_ * kept.n_longest
         channels = first.input_names, self.output_names_
         wrong = tell_of_mislabelled(local, kept.kappa, longest, *channels)
+        again = partial(identify, points=kept, runner=replace(runner, verbose=0))
+        known = again, self.sampling_time_, told
+        if not wrong:
+            estimator, local = with_delays(
+                estimator, local, kept, *known, first.input_names
+            )
         if black_boxes and not wrong:
-            quiet = replace(runner, verbose=0)
-            again = partial(identify, points=kept, runner=quiet)
+            grows = refused is not None
             estimator, local = integrated(
-                estimator,
-                local,
-                kept,
-                again,
-                sampling_time=self.sampling_time_,
-                output_names=self.output_names_,
-                told=told,
-                growing=refused is not None,
+                estimator, local, kept, *known, self.output_names_, growing=grows
             )
             said = len(told)
             order = _foreseen_order(estimator, local, kept, longest, again)

@@ -174,7 +174,7 @@ def d2c_held(
         raise ValueError(
             f"`method={method!r}` needs poles away from the origin: a pole at "
             f"{size.min():.1e} is a pure delay and has no continuous equivalent. Use "
-            "`method='tustin'` or a lower order."
+            "`method='tustin'`, an `input_delay` in its place, or a lower order."
         )
     negative = _on_negative_axis(poles.real, poles.imag)
     if negative.any():

@@ -28,10 +28,10 @@ def integrated(
     local: list[LocalModel],
     points: OperatingPoints,
     identify: Callable[[Any], tuple[list[LocalModel], OperatingPoints]],
-    *,
     sampling_time: float,
-    output_names: Sequence[Hashable],
     told: list[Told],
+    output_names: Sequence[Hashable],
+    *,
     growing: bool = False,
 ) -> tuple[Any, list[LocalModel]]:
     """An estimator that knows which outputs integrate, and its models.

@@ -49,6 +49,7 @@ _APART = 0.1
 _STANDING = 0.05
 
 _ABOUT_ZERO = 0.25  # of the others: it may be one, known by samples that are not many
+ALTERNATES = "alternates"  # a kind of warning
 _TWICE = (  # of models of rates, on top of what else may be done
     "Where rates integrate as well, as the velocity of what nothing holds, have a "
     "structure say so: restructurer=GrayBoxRestructurer(structure) with zeros in its "
@@ -775,7 +776,8 @@ def _continuous(
             f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
             "that order has: without a structure what becomes of the point is near it "
             "at low frequencies only. A shorter sampling time or a lower `order` "
-            "avoids it."
+            "avoids it.",
+            kind=ALTERNATES,
         )
     return lti
 

@@ -1,0 +1,88 @@
+"""Inputs that arrive late, where nobody said so.
+
+Each sample of a delay takes a state of the local models, which between operating points
+stand for no delay, or bends the parameters of a structure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from sklearn.base import clone
+
+from ...data.experiments import Experiment
+from ...data.operating_points import OperatingPoints
+from ...exceptions import Told, collected, warn
+from ...subspace.estimator import SubspaceLTI
+from .local_models import ALTERNATES, LocalModel, integrates
+
+# What is told of models that a delay is missing in: that, what else a model of a given
+# order may lack, and poles that alternate from sample to sample.
+_SHOWN = {"delay", "lack", ALTERNATES}
+
+
+def with_delays(
+    estimator: Any,
+    local: list[LocalModel],
+    points: OperatingPoints,
+    identify: Callable[[Any], tuple[list[LocalModel], OperatingPoints]],
+    sampling_time: float,
+    told: list[Told],
+    input_names: Sequence[Hashable],
+) -> tuple[Any, list[LocalModel]]:
+    """An estimator that finds delays, and its models, if these are likelier.
+
+    Where something was `told` of delays at a point, and none is given: what was told is
+    taken back then. Or of what one sample may be told as: then with delays nothing of
+    the kind is told any more. All points must have the same.
+    """
+    said = {one.kind for one in told}
+    kinds = said & _SHOWN
+    if not kinds or "useless" in said or not _is_to_have_none(estimator):
+        return estimator, local
+    finding, found = clone(estimator).set_params(input_delay="auto"), list[LocalModel]()
+    with collected() as later, suppress(ValueError):
+        found = identify(finding)[0]
+    still = {one.kind for one in later} & kinds
+    if len(found) < len(points) or ("delay" not in kinds and still):
+        return estimator, local
+    pairs = zip(found, points.experiments, strict=True)
+    cost = sum(_cost(*pair, sampling_time) for pair in pairs)
+    if not cost < sum(model.criterion for model in local):
+        return estimator, local
+    delays = np.array([model.lti.input_delay for model in found]) / sampling_time
+    first = np.round(delays[0])
+    if not first.any() or (np.round(delays) != first).any():
+        return estimator, local  # an LPV model has one
+    delay = first.astype(int).tolist()
+    told[:] = later
+    before, after = (
+        ", ".join(map(str, sorted({model.order for model in own})))
+        for own in (local, found)
+    )
+    warn(
+        f"inputs {list(input_names)} arrive after {delay} samples, by models that are "
+        f"likelier so: of order(s) {after}, without delays of {before}."
+        f" Use local=SubspaceLTI(input_delay={delay}) to say so, or "
+        f"input_delay={[0] * len(delay)} to have none."
+    )
+    return finding, found
+
+
+def _cost(
+    model: LocalModel, experiments: Sequence[Experiment], sampling_time: float
+) -> float:
+    """The criterion of as many samples, whatever is unknown of the first ones."""
+    longest = float(model.lti.input_delay.max(initial=0.0)) / sampling_time
+    known = sum(len(e.rows) - longest for e in experiments)
+    return model.criterion * sum(len(e.rows) for e in experiments) / known
+
+
+def _is_to_have_none(estimator: Any) -> bool:
+    """Whether an estimator has no delay by default, which a list would ask for."""
+    if type(estimator) is not SubspaceLTI or integrates(estimator):
+        return False
+    return isinstance(estimator.input_delay, int) and estimator.input_delay == 0
