@@ -24,8 +24,9 @@ from .trends import with_trends
 
 Array = NDArray[np.float64]
 
-# Share of the squared errors that later inputs leave where the outputs lead them
-_LED = 0.1
+# Share of the squared errors that later inputs leave where the outputs lead them; or
+# where half the states are enough beside these, as for inputs that foretell themselves
+_LED, _NO_MORE = 0.1, 0.9
 _LINE = 3.0  # time constants per experiment of a mode that may be a reference's line
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
@@ -159,8 +160,9 @@ def _alternates(fitted: LocalFit) -> bool:
 def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     """Tell of outputs that lead the inputs, where these seem to know the noise.
 
-    Beside later inputs a model simulates parts held out far better, and there is no
-    feedback. So does the inverse of a controller that leaves little to its reference.
+    Beside later inputs a model simulates parts held out far better, or better with half
+    the states, and there is no feedback. So does the inverse of a controller that
+    leaves little to its reference.
     """
     (pairs, choices, telling), n_trend = samples, fitted.evidence.free.n_trend
     lead, latest = find_lead(pairs)
@@ -172,7 +174,7 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     led = _OF_NOISE if fitted.grows() else _LED
     # One order tells whether it is worth while to look for the best.
     first = choices.order or max(1, fitted.selection.order)
-    for order, share in {first: _OF_NOISE, choices.order: led}.items():
+    for order, share in {first: _NO_MORE, choices.order: led}.items():
         later = later.having(order=order)
         try:
             other = later.fit(n_trend)
@@ -181,6 +183,8 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
         if other.feedback is None or other.feedback.found:
             return
         found = later.errors_held_out(other)
+        if order is None and 2 * other.selection.order <= fitted.selection.order:
+            share = _NO_MORE
         if not found.total < share * error.total:
             return
     # A reference of a few lines is the free motion of modes that do not decay.
@@ -190,7 +194,8 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
             "lead",
             f"The outputs seem to know input {telling.input(latest)} at least {lead} "
             "sample(s) ahead: beside inputs that come so much later, a model without "
-            f"feedback simulates {found.bft:.3g} % of parts held out, this one "
+            f"feedback, of order {other.selection.order}, simulates {found.bft:.3g} % "
+            f"of parts held out, this one, of order {fitted.selection.order}, "
             f"{error.bft:.3g} %. Either the outputs lead it, by clocks or filters: "
             "move it by as much. Or a controller makes it of the outputs and leaves "
             "little to its reference: that must move more for a plant to be found.",
