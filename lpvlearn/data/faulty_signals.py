@@ -47,7 +47,7 @@ _BEFORE, _AFTER = 0.05, 0.75
 # is larger than this one, and that of its samples are neither near the top nor bottom.
 # Or so many times, of a range that is this part of a revolution at least.
 _REVOLUTION, _REVOLUTIONS, _OTHER_STEPS, _BETWEEN = 0.8, 3, 0.3, 0.3
-_ABOUT_NORTH, _WHOLE, _ROUNDED = 2, 0.9, 1e-3
+_ABOUT_NORTH, _WHOLE, _ROUNDED, _ALIKE = 2, 0.9, 1e-3, 2.0
 
 
 def far_out(signals: Array) -> NDArray[np.bool_]:
@@ -262,9 +262,12 @@ def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
         if not _WHOLE * period < width <= (1.0 + _ROUNDED) * period:
             continue
         turns = [np.abs(step) > 0.5 * period for step in steps]
-        left = [step - period * np.round(step / period) for step in steps]
+        left = [np.abs(step - period * np.round(step / period)) for step in steps]
+        far, rest = np.concatenate(turns), np.concatenate(left)
+        others = rest[~far].max(initial=0.0)
+        # as all steps are, and not to one value and back, as where a sensor drops out
+        small = others < _OTHER_STEPS * period and rest[far].max() < _ALIKE * others
         n_turns = _by_themselves(turns, inputs)
-        small = np.abs(np.concatenate(left)).max(initial=0.0) < _OTHER_STEPS * period
         if n_turns >= _ABOUT_NORTH and small:
             return n_turns
     return 0

@@ -177,6 +177,15 @@ def test_rows_that_are_missing_are_told():
     for rows in (slice(100, 300), slice(0, 300, 3)):
         assert torn(u.iloc[rows]) == []
     assert torn(parts.assign(run=parts.index // 150), experiment="run") == []
+    # a tenth or a half at random, as dropna leaves them; of every third row, too
+    rng = np.random.default_rng(0)
+    for share in (0.1, 0.5):
+        assert torn(u[rng.random(300) > share])
+        assert torn(u[::3][rng.random(100) > share])
+    # rows of two experiments that take turns, and numbers that mean nothing
+    turns = u.assign(run=rng.integers(2, size=300))
+    assert torn(turns, experiment="run") == []
+    assert torn(u.set_index(np.cumsum(rng.integers(1, 100, size=300)))) == []
 
 
 def test_an_output_left_in_the_table_is_refused():

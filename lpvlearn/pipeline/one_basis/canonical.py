@@ -39,7 +39,9 @@ from .black_boxes import of_rates
 
 Array = NDArray[np.float64]
 
-_LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at most
+# The degree of a polynomial, and both degrees of a fraction, at most; and degrees of
+# freedom that each parameter of one of a degree more has, at least.
+_LOW, _SPARE = (2, 3), 2
 
 # Times the chi-square of a form, that of constants: noise moves no point so far
 _EXPLAINED = 1e4
@@ -167,7 +169,7 @@ def is_better_form(
     structure, theta, covariance = canonical
     form = auto.best_estimator_
     # aligned states let the rate jump with kappa, and an integrator keeps that
-    if not (_is_low(form) or local[0].integrating):
+    if not (_is_low(form, structure.n_params) or local[0].integrating):
         return False
     if not holds_within_range(structure, form):
         return False
@@ -222,13 +224,15 @@ def _matrix(model: StateSpace) -> Array:
     return np.block([[model.A, model.B], [model.C, model.D]])
 
 
-def _is_low(form: Any) -> bool:
+def _is_low(form: Any, n_params: int) -> bool:
     """Whether a form is simple, and the points are more than it needs."""
     plain, fraction = _LOW
     if isinstance(form, PolynomialLPV):
         low = form.degree <= plain
     elif isinstance(form, RationalLPV):
-        low = form.degree + form.denominator <= fraction
+        beyond = form.degree + form.denominator - fraction
+        spare = form.degrees_of_freedom_ >= _SPARE * n_params
+        low = beyond <= (1 if spare else 0)
     else:
         return False
     return low and form.degrees_of_freedom_ > 0

@@ -123,7 +123,8 @@ def tell_unforeseen(
             f"{known}, and the others do not foresee point(s) "
             f"{listed_errors(worst, kappa)}, by the error in the largest gain: between "
             f"points the LPV model may be as wrong. {alone}Look at `parameters_` for a "
-            "point that is unlike the others, give a structure where there is none, or "
+            "point that is unlike the others, give a structure where there is none "
+            "(a canonical one: restructurer=GrayBoxRestructurer()), or "
             "measure in between (`suggest_operating_point`)."
         )
     if often or most or saturated:
@@ -137,7 +138,9 @@ def tell_unforeseen(
             f"{label_of(kappa[other])}) curves through all of them differ, one that "
             f"keeps their shape and a smooth one: by {100.0 * apart:.0f} % of the "
             "largest gain, as wrong as the LPV model may be there. Give a structure "
-            "where there is none, or measure in between (`suggest_operating_point`)."
+            "where there is none (a canonical one: "
+            "restructurer=GrayBoxRestructurer()), or measure in between "
+            "(`suggest_operating_point`)."
         )
 
 
