@@ -57,8 +57,9 @@ def integrated(
         found = identify(knowing)[0] if whole else []
         if len(found) < len(points):
             found = []
-        elif _error(found, points, sampling_time) >= _POORER * _error(
-            local, points, sampling_time
+        elif not (
+            _error(found, points, sampling_time)
+            < _POORER * _error(local, points, sampling_time)
         ):
             found = []
     if not found:

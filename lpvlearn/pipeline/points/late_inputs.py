@@ -40,8 +40,10 @@ def with_delays(
     the kind is told any more. All points must have the same.
     """
     said = {one.kind for one in told}
-    kinds = said & _SHOWN
+    kinds, own = said & _SHOWN, sum(model.criterion for model in local)
     if not kinds or "useless" in said or not _is_to_have_none(estimator):
+        return estimator, local
+    if not np.isfinite(own):  # of averages
         return estimator, local
     finding, found = clone(estimator).set_params(input_delay="auto"), list[LocalModel]()
     with collected() as later, suppress(ValueError):
@@ -51,7 +53,7 @@ def with_delays(
         return estimator, local
     pairs = zip(found, points.experiments, strict=True)
     cost = sum(_cost(*pair, sampling_time) for pair in pairs)
-    if not cost < sum(model.criterion for model in local):
+    if not cost < own:
         return estimator, local
     delays = np.array([model.lti.input_delay for model in found]) / sampling_time
     first = np.round(delays[0])
@@ -60,8 +62,8 @@ def with_delays(
     delay = first.astype(int).tolist()
     told[:] = later
     before, after = (
-        ", ".join(map(str, sorted({model.order for model in own})))
-        for own in (local, found)
+        ", ".join(map(str, sorted({model.order for model in models})))
+        for models in (local, found)
     )
     warn(
         f"inputs {list(input_names)} arrive after {delay} samples, by models that are "

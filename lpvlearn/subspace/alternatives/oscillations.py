@@ -210,7 +210,7 @@ def _turns(evidence: Evidence) -> Array:
     records = evidence.whitening.records(evidence.records, free)
     n_samples = sum(record.n_samples for record in records)
     n_left = n_samples * len(model.C) - n_parameters(len(model.A), records, free)
-    turns = turns[~_are_of_inputs(turns, evidence.records)]
+    turns = turns[~_are_of_inputs(turns, thinned(evidence.records))]
     if not (len(turns) and evidence.refined and n_left > 0):
         return turns[:0]
     fitted = _beside(turns, model, records, free, _DEGREE)
@@ -231,11 +231,12 @@ def _are_of_inputs(turns: Array, records: Sequence[Record]) -> NDArray[np.bool_]
     for record in records:
         bin_ = 2.0 * np.pi / record.n_samples
         around = np.arange(-_BESIDE, _BESIDE + 1) * bin_
-        spectrum = np.exp(
-            -1j * np.arange(record.n_samples) * (turns + around[:, None])[..., None]
-        )
         motion = record.u - record.u.mean(axis=1, keepdims=True)
-        energy = np.abs(spectrum @ motion.T) ** 2  # (n_around, n_turns, n_inputs)
+        turned = (
+            -1j * (turns + around[:, None])[..., None] * np.arange(record.n_samples)
+        )
+        # (n_around, n_turns, n_inputs)
+        energy = np.abs(np.exp(turned) @ motion.T) ** 2
         beside = np.abs(around) > _WITHIN * bin_
         line = energy[~beside].max(axis=0)
         stands = line > _STANDS_OUT * energy[beside].mean(axis=0)
