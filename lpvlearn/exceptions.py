@@ -95,6 +95,14 @@ def repeat(told: Iterable[Told]) -> None:
         warn(message, category, kind)
 
 
+@contextmanager
+def only_of(kind: str) -> Iterator[None]:
+    """Drop what the block warns of, but for a kind."""
+    with collected() as told:
+        yield
+    repeat(one for one in told if one.kind == kind)
+
+
 def take_back(kind: str) -> None:
     """Drop warnings of a kind, of those that were not given yet."""
     collecting = _COLLECTING.get()

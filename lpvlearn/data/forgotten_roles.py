@@ -32,6 +32,8 @@ _RESTARTS, _WHOLE = 0.05, 0.3
 
 _ALIKE = 100  # samples from which columns that agree to the bit are one
 
+DISORDER = "disorder"  # the kind of warnings of rows: of these comes what else is told
+
 _ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
 
 _HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
@@ -131,7 +133,8 @@ def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
                 "needs the samples in the order of time. If they were shuffled, sort "
                 "them (sort_index of pandas) and split by experiment with "
                 "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
-                "means nothing, drop it (reset_index)."
+                "means nothing, drop it (reset_index).",
+                kind=DISORDER,
             )
             return
         if index.inferred_type == "integer" and len(labels) > _FEWEST:
@@ -151,7 +154,8 @@ def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
                     "goes on there. Split by experiment (ExperimentSplit) or in time "
                     "(BlockedTimeSeriesSplit), not by KFold; of rows that were dropped "
                     "name the `time` and use missing='split'; if the index means "
-                    "nothing, drop it (reset_index)."
+                    "nothing, drop it (reset_index).",
+                    kind=DISORDER,
                 )
                 return
 

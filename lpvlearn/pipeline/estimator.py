@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -22,6 +22,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import NO_TIME, ROLES, Experiment
+from ..data.forgotten_roles import DISORDER
 from ..data.operating_points import (
     OperatingPoints,
     check_outputs,
@@ -33,7 +34,15 @@ from ..data.operating_points import (
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.tables import as_list, read_outputs
 from ..data.timestamps import TIME_TOL
-from ..exceptions import Told, all_or_nothing, collected, retold, take_back, warn
+from ..exceptions import (
+    Told,
+    all_or_nothing,
+    collected,
+    only_of,
+    retold,
+    take_back,
+    warn,
+)
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
@@ -48,6 +57,7 @@ from ..structures.structure import GrayBoxStructure
 from ..subspace.diagnosis.faulty_outputs import LINE
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.fits.integrating import integrating_flags
+from ..subspace.telling import SPOILING
 from ..systems.threads import one_blas_thread
 from ..systems.whole_files import whole_file
 from ..validation import (
@@ -58,7 +68,7 @@ from ..validation import (
     units_by_name,
     verbosity,
 )
-from .checks.stability import growth_rates
+from .checks.stability import GROWS, growth_rates
 from .one_basis.between_samples import restructured_by_hold
 from .one_basis.black_boxes import foreseen_order
 from .one_basis.structured_models import (
@@ -538,14 +548,15 @@ list, default=None
             steps |= {"interpolator": self.interpolator, "refiner": self.refiner}
         memory = checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-        restructurer, watch = self.restructurer, Stopwatch(verbose=self.verbose)
+        watch = Stopwatch(verbose=self.verbose)
 
-        with watch.step("reading of the table"):  # steps 1 and 2, and their groups
+        # steps 1 and 2, and their groups
+        with watch.step("reading of the table"), retold() as said:
             experiments = without_spikes(read())
             self.n_outputs_ = len(self.output_names_)
             check_outputs(experiments, self.output_names_)
             self.time_jitter_ = max(e.jitter for e in experiments)
-            structure = getattr(restructurer, "structure", None)
+            structure = getattr(self.restructurer, "structure", None)
             _check_channels(
                 structure, experiments[0].input_names, self.output_names_, self.inputs
             )
@@ -560,7 +571,27 @@ list, default=None
         with watch.step("local models", bar=True), retold() as told:  # step 3
             first = experiments[0]
             local, points = self._identified(points, structure, first, runner, told)
+            # of samples that are none of the system's nothing else need be said
+            causes = [one for one in told if one.kind in SPOILING]
+            disorder = any(one.kind == DISORDER for one in said)
+            spoilt = disorder or bool(causes)
+            told[:] = causes if spoilt else told
 
+        with only_of(GROWS) if spoilt else nullcontext():
+            self._interpolate(local, points, first, moving, runner, watch)
+        self.step_times_ = watch.seconds
+
+    def _interpolate(
+        self,
+        local: list[LocalModel],
+        points: OperatingPoints,
+        first: Experiment,
+        moving: list[Experiment],
+        runner: PointRunner,
+        watch: Stopwatch,
+    ) -> None:
+        """Steps 4 and 5, and refinement on experiments that are `moving`."""
+        restructurer = self.restructurer
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
@@ -587,7 +618,7 @@ list, default=None
             if together is not None:
                 self.interpolator_, covariance, models = together
             self.scheduling_range_ = found.points.identified_range
-            self.scheduling_names_ = list(experiments[0].scheduling_names)
+            self.scheduling_names_ = list(first.scheduling_names)
             tell_of_joint_scheduling(kappa, self.scheduling_names_)
             self.lpv_ = LPVStateSpace(
                 found.structure,
@@ -597,7 +628,7 @@ list, default=None
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
-                input_names=experiments[0].input_names,
+                input_names=first.input_names,
                 output_names=self.output_names_,
                 units=self.units,
                 hold=found.local[0].hold,
@@ -640,7 +671,6 @@ list, default=None
                 self.hinf_parameters_.iloc[row] = getattr(
                     fitted, "hinf_params_", fitted.params_
                 )
-        self.step_times_ = watch.seconds
 
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""

@@ -33,7 +33,7 @@ from ..systems.threads import one_blas_thread
 from ..validation import frequencies, naming_argument, one_of
 from .completion import completed, completed_by
 from .diagnosis.cross_checks import tell_of_delay
-from .diagnosis.fit_warnings import TESTS, warn_about
+from .diagnosis.fit_warnings import TESTS, warn_about, warn_about_pole
 from .diagnosis.horizons import warn_about_horizon
 from .evidence.offsets import Offsets, of_rates
 from .evidence.residuals import (
@@ -619,6 +619,9 @@ class SubspaceLTI(ScoredFromRest):
         self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
         self._take_beginning(experiments)
         if telling.silent:
+            return fitted
+        if telling.spoilt:
+            warn_about_pole(fitted.model.A, telling, fitted)
             return fitted
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):

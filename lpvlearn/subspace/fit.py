@@ -74,7 +74,8 @@ def fit_samples(
     fitted = without_modes_of_few_lines(samples, fitted)
     if not telling.silent:
         tell_of_logging(pairs, fitted, telling)
-        _tell_of_signals(outputs, samples, fitted)
+        if not telling.spoilt:
+            _tell_of_signals(outputs, samples, fitted)
     whole, rest, differ = samples, None, fitted.offsets.differ
     samples, fitted = without_shifts(samples, fitted)
     if samples is whole:
@@ -95,7 +96,8 @@ def fit_samples(
         fitted = held_by_a_loop(samples, fitted)
     elif may_share_noise(fitted, choices):
         fitted = with_shared_noise(samples, fitted)
-    if not telling.silent:
+    quiet = telling.silent or telling.spoilt
+    if not quiet:
         _tell_of_loop(samples, fitted, doubt, like)
     if len(turns) and fitted.method != "pbsid":
         fitted = fitted._replace(evidence=fitted.evidence.beside(turns=turns))
@@ -105,7 +107,7 @@ def fit_samples(
         fitted = moved_back(fitted, first, differ)
     if detrend is not None:
         fitted = fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
-    if choices.offset == "auto" and not telling.silent:
+    if choices.offset == "auto" and not quiet:
         tell_of_drift(fitted, outputs, telling)
     return fitted, samples
 

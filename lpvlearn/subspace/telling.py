@@ -12,6 +12,10 @@ from typing import Self, SupportsIndex
 
 from ..exceptions import warn
 
+# Kinds of warnings of samples that are none of the system's: what else may be told of a
+# model that was made of them comes of that.
+SPOILING = frozenset({"dropouts", "lines", "bursts", "wraps"})
+
 _UNHEARD: ContextVar[bool] = ContextVar("unheard", default=False)
 
 
@@ -37,6 +41,7 @@ class Telling:
     outputs: Sequence[Hashable] | None = None
     kinds: set[str] = field(default_factory=set)  # of warnings that were given
     silent: bool = field(default_factory=_UNHEARD.get)
+    spoilt: bool = False  # whether something of a `SPOILING` kind was told
 
     def __contains__(self, kind: str) -> bool:
         return kind in self.kinds
@@ -47,6 +52,7 @@ class Telling:
         """Warn of a kind of thing that was not told before; from now on it was."""
         if kind not in self:
             self.kinds.add(kind)
+            self.spoilt |= kind in SPOILING
             warn(message, category, kind)
 
     def aside(self, *silent: str) -> Self:

@@ -931,3 +931,26 @@ def test_scheduling_whose_noise_moves_the_outputs_is_told(noise):
     ]
     assert len(said) == (noise > 0.0)
     assert all("'level'" in text and "'y'" in text for text in said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoilt", ["by a sensor", "by its order"])
+def test_what_spoils_a_record_is_told_alone(spoilt):
+    """Of all else that it makes, there were up to twenty warnings."""
+    X, y = spring_tables(noise=0.01, n_samples=400)
+    if spoilt == "by a sensor":
+        y = y.mask(np.random.default_rng(0).random(y.shape) < 0.005, -9999.0)
+        cause = "falls to -9999"
+    else:
+        X = X.drop(columns="time").sample(frac=1, random_state=0)
+        y, cause = y.loc[X.index], "not in the order of its index"
+    roles = {k: v for k, v in ROLES.items() if v in X.columns}
+    chain = LocalLPVPipeline(sampling_time=0.02, **roles)
+    chain.set_params(restructurer=GrayBoxRestructurer(spring_structure()))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        chain.fit(X, y)
+    first, *others = (str(w.message) for w in told)
+    assert cause in first
+    known = "`lpv_` is unstable", "If a sensor got them wrong"
+    assert [other for other in others if not any(k in other for k in known)] == []

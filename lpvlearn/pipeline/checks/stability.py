@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 _STEPS = 20  # into which the way from a point to its neighbour is cut
 
+GROWS = "grows"  # the kind of its warning
 _GROWN = 0.01  # share by which what counts as growing does so over a record, at least
 
 _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
@@ -73,7 +74,8 @@ def growth_rates(
             f"`lpv_` is unstable at values within its range, of {places}: a pole has "
             f"real part {worst:.3g} 1/s, and simulations that stay there grow without "
             f"bound. {cause} Use a lower degree, or measure there too "
-            "(`suggest_operating_point`)."
+            "(`suggest_operating_point`).",
+            kind=GROWS,
         )
     return rates
 
