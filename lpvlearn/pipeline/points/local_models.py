@@ -49,15 +49,17 @@ _APART = 0.1
 _STANDING = 0.05
 
 _ABOUT_ZERO = 0.25  # of the others: it may be one, known by samples that are not many
-ALTERNATES = "alternates"  # a kind of warning
-_TWICE = (  # of models of rates, on top of what else may be done
+_NOTHING = 1e-6  # share by which what does not decay, to rounding, may do so or grow
+HARDLY = 0.05  # share by which an integrator may decay, or grow, in a record
+_GROWN = 3.0  # time constants per record, up to which one that grows may be one
+
+_TWICE = (  # advice for models of rates
     "Where rates integrate as well, as the velocity of what nothing holds, have a "
     "structure say so: restructurer=GrayBoxRestructurer(structure) with zeros in its "
     "A. Else try "
 )
-_NOTHING = 1e-6  # share by which what does not decay, to rounding, may do so or grow
-HARDLY = 0.05  # share by which an integrator may decay, or grow, in a record
-_GROWN = 3.0  # time constants per record, up to which one that grows may be one
+
+ALTERNATES = "alternates"  # the kind of a warning, of poles on the negative real axis
 
 # States that a disturbance may have beside those of a structure: two resonances, or a
 # resonance and two drifts.
@@ -759,7 +761,9 @@ def _continuous(
         lti = forgetting(lti, 2.0 * _NOTHING * about_zero.rate)
     elif growth > 0.0:
         worst = lti.poles()[np.argmax(lti.poles().real)]
-        named = _integrating_outputs(lti, _GROWN * about_zero.rate)
+        named = ""
+        if advice is not _TWICE:  # whose outputs are named
+            named = _integrating_outputs(lti, _GROWN * about_zero.rate)
         raise (Integrates if named else ValueError)(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. "
             f"{named}{advice}"
