@@ -55,12 +55,7 @@ def integrated(
     with collected() as later, suppress(ValueError):
         knowing.set_params(integrating=places)
         found = identify(knowing)[0] if whole else []
-        if len(found) < len(points):
-            found = []
-        elif not (
-            _error(found, points, sampling_time)
-            < _POORER * _error(local, points, sampling_time)
-        ):
+        if len(found) < len(points) or _are_poorer(found, local, points, sampling_time):
             found = []
     if not found:
         warn(
@@ -87,15 +82,23 @@ def integrating_outputs(local: Sequence[LocalModel], rate: float) -> list[int]:
     return sorted(set.intersection(*map(set, found)))
 
 
-def _error(
-    models: Sequence[LocalModel], points: OperatingPoints, sampling_time: float
-) -> float:
-    """What models leave of the experiments at their points, squared percents.
+def _are_poorer(
+    found: Sequence[LocalModel],
+    others: Sequence[LocalModel],
+    points: OperatingPoints,
+    sampling_time: float,
+) -> bool:
+    """Whether models leave more of the local experiments than other ones.
 
     As far as that is more than next to nothing.
     """
-    fits = [
-        fit_of(m.lti, Measured.of(group), sampling_time, m.n_trend, m.hold)
-        for m, group in zip(models, points.experiments, strict=True)
-    ]
-    return float(np.sum(np.maximum(100.0 - np.array(fits), _EXACT) ** 2))
+    measured = [Measured.of(group) for group in points.experiments]
+
+    def error(models: Sequence[LocalModel]) -> float:
+        fits = [
+            fit_of(m.lti, known, sampling_time, m.n_trend, m.hold)
+            for m, known in zip(models, measured, strict=True)
+        ]
+        return float(np.sum(np.maximum(100.0 - np.array(fits), _EXACT) ** 2))
+
+    return not error(found) < _POORER * error(others)
