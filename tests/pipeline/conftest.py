@@ -8,6 +8,9 @@ from ..conftest import spring_sweep, spring_tables
 
 N_SAMPLES = 300
 
+# Columns of tables that `from_trajectories` makes.
+OF_TRAJECTORIES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+
 FINE = np.linspace(0, 1.5, 7)
 
 

@@ -16,7 +16,7 @@ from lpvlearn import (
 from lpvlearn.pipeline.points.integrators import integrating_outputs
 from lpvlearn.pipeline.points.local_models import LocalModel
 
-ROLES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+from .conftest import OF_TRAJECTORIES as ROLES
 
 
 @pytest.mark.parametrize(

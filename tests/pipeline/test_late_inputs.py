@@ -14,7 +14,8 @@ from lpvlearn import (
     from_trajectories,
 )
 
-ROLES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+from .conftest import OF_TRAJECTORIES as ROLES
+
 STEP = 0.1
 LAG = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
 
