@@ -66,3 +66,16 @@ def test_delays_that_differ_are_told_and_not_taken():
         chain.fit(X, y)
     assert not chain.lpv_.input_delay.any()
     assert any("input_delay" in str(w.message) for w in told)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:no form fits the parameters")
+def test_points_that_are_asked_for_delays_keep_their_own_where_these_differ():
+    delays = [2, 4, 6, 8]
+    X, y = records(delays, kappas=(1.0, 1.3, 1.6, 2.0))
+    chain = LocalLPVPipeline(SubspaceLTI(input_delay="auto"), **ROLES)
+    with pytest.warns(UserWarning, match="delay differs between operating points"):
+        chain.fit(X, y)
+    own = [model.input_delay[0] / STEP for model in chain.local_models_]
+    assert np.allclose(own, delays)
+    assert [model.order for model in chain.local_models_] == [1] * 4

@@ -6,7 +6,7 @@ the inputs, whether outputs drift.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 # Points that together tell one delay of all, and by how much, in twice the logarithm of
 # the likelihood, it must be likelier than another; or a delay of a point of its own.
 _PROBED, _CLEARER = 5, 6.0
+_CHANCE = 2  # samples by which delays that points find for themselves may differ
 
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first: a mode may vanish, or come.
@@ -183,70 +184,95 @@ def _with_one_delay(
     as with transport at another speed.
     """
     found = tried(local, _spread(len(groups), _PROBED))
-    rest, gaps = local.initial_state == "rest", local.missing != "raise"
     known: dict[tuple[int, ...], list[Done | None]] = {}
 
-    def models_of(found: Sequence[Done | None]) -> dict[int, LocalModel]:
-        return {k: done.result for k, done in enumerate(found) if done is not None}
+    def costs_of(found: Sequence[Done | None]) -> dict[int, float]:
+        return {
+            k: cost_with_delay(local, done.result, groups[k], sampling_time)
+            for k, done in enumerate(found)
+            if done is not None
+        }
 
-    own = models_of(found)
+    def delay_of(done: Done) -> NDArray[np.intp]:
+        return delay_in_samples(done.result, sampling_time)
 
-    def delay_of(model: LocalModel) -> NDArray[np.intp]:
-        return np.round(model.lti.input_delay / sampling_time).astype(np.intp)
+    own = costs_of(found)
+    least_of_own = sum(own.values())
 
-    def n_samples(k: int, delay: NDArray[np.intp]) -> int:
-        """Those of a point whose inputs are known."""
-        late = with_late_inputs(groups[k], delay, rest=rest, gaps=gaps)
-        return sum(len(e.rows) for e in late)
-
-    def cost(models: Mapping[int, LocalModel]) -> float:
-        """Of as many samples, whatever is unknown of the first ones."""
-        if models.keys() != own.keys():
-            return np.inf
-        return sum(
-            model.criterion * n_samples(k, none) / n_samples(k, delay_of(model))
-            for k, model in models.items()
-        )
-
-    def having(delay: NDArray[np.intp]) -> tuple[Any, list[Done | None]]:
+    def having(
+        delay: NDArray[np.intp], points: Sequence[int]
+    ) -> tuple[Any, list[Done | None]]:
         """The estimator and its models, which of a delay found is that of one given."""
-        given, key = delay.tolist(), tuple(delay.tolist())
-        estimator = clone(local).set_params(input_delay=given)
-        if key not in known:
-            same = [
-                done is not None and (delay_of(done.result) == delay).all()
-                for done in found
-            ]
-            pairs = zip(found, same, strict=True)
-            alike = [done if is_same else None for done, is_same in pairs]
-            known[key] = tried(estimator, list(own), alike)
-        return estimator, known[key]
+        estimator = clone(local).set_params(input_delay=delay.tolist())
+        have = [
+            done if done is not None and (delay_of(done) == delay).all() else None
+            for done in found
+        ]
+        have = known.get(tuple(delay.tolist()), have)
+        new = tried(estimator, points, have) if points else have
+        models = [a if b is None else b for a, b in zip(have, new, strict=True)]
+        known[tuple(delay.tolist())] = models
+        return estimator, models
 
-    def cost_with(delay: NDArray[np.intp]) -> float:
-        return cost(models_of(having(delay)[1]))
+    def cost(delay: NDArray[np.intp], limit: float = np.inf) -> float:
+        """Or infinity, where a point alone shows that it is beyond a limit."""
+        for points in ([min(own)], list(own)):
+            costs = costs_of(having(delay, points)[1])
+            if any(k not in costs for k in points):
+                return np.inf
+            if not sum((own | costs).values()) < limit + _CLEARER * len(own):
+                return np.inf
+        return sum(costs.values())
 
-    none = np.zeros(groups[0][0].inputs.shape[1], np.intp)
-    if len(own) < 2 or not np.isfinite(cost(own)):
+    if len(own) < 2 or not np.isfinite(least_of_own):
         return local, found
-    delays = np.array([delay_of(model) for model in own.values()])
+    delays = np.array([delay_of(done) for done in found if done is not None])
     delay = np.sort(delays, axis=0)[(len(own) - 1) // 2]
     agree = bool((delays == delay).all())
     if agree and delay.any():
-        return having(delay)
-    state = len(own) * PRICE * (len(delay) + groups[0][0].measured.shape[1])
-    least = cost_with(delay)
+        return having(delay, [])
+    inputs, outputs = groups[0][0].inputs.shape[1], groups[0][0].measured.shape[1]
+    state = len(own) * PRICE * (inputs + outputs)
+    far_apart = bool((np.ptp(delays, axis=0) > _CHANCE).any())
+    least = cost(delay, least_of_own if far_apart else np.inf)
+    if np.isinf(least):
+        return local, found
     for sample in np.eye(len(delay), dtype=np.intp):
         for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
-            delay, least = _along(step, worth, (delay, least), cost_with)
-    alike = least < cost(own) + _CLEARER * (len(own) - 1)
-    return having(delay) if alike else (local, found)
+            delay, least = _along(step, worth, (delay, least), cost)
+    alike = least < least_of_own + _CLEARER * (len(own) - 1)
+    return having(delay, []) if alike else (local, found)
+
+
+def cost_with_delay(
+    local: SubspaceLTI,
+    model: LocalModel,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+) -> float:
+    """The criterion of as many samples, whatever is unknown of the first ones."""
+    rest, gaps = local.initial_state == "rest", local.missing != "raise"
+    delay = delay_in_samples(model, sampling_time)
+    n_samples, n_known = (
+        sum(
+            len(e.rows)
+            for e in with_late_inputs(experiments, some, rest=rest, gaps=gaps)
+        )
+        for some in (np.zeros_like(delay), delay)
+    )
+    return model.criterion * n_samples / n_known
+
+
+def delay_in_samples(model: LocalModel, sampling_time: float) -> NDArray[np.intp]:
+    """The delays of the inputs of a local model."""
+    return np.round(model.lti.input_delay / sampling_time).astype(np.intp)
 
 
 def _along(
     step: NDArray[np.intp],
     worth: float,
     start: tuple[NDArray[np.intp], float],
-    cost: Callable[[NDArray[np.intp]], float],
+    cost: Callable[[NDArray[np.intp], float], float],
 ) -> tuple[NDArray[np.intp], float]:
     """The delay of least cost some steps from a start, where that is `worth` it.
 
@@ -255,7 +281,7 @@ def _along(
     delay, least = start
     best, lowest, other = start, least - worth, delay + step
     while (other >= 0).all():
-        reached = cost(other)
+        reached = cost(other, least + _CLEARER)
         if not reached < least + _CLEARER:
             break
         if reached < lowest:

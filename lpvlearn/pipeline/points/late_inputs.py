@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from sklearn.base import clone
 
-from ...data.experiments import Experiment
 from ...data.operating_points import OperatingPoints
 from ...exceptions import Told, collected, warn
 from ...subspace.estimator import SubspaceLTI
+from .common_choices import cost_with_delay, delay_in_samples
 from .local_models import ALTERNATES, LocalModel, integrates
 
 # What is told of models that a delay is missing in: that, what else a model of a given
@@ -52,14 +52,13 @@ def with_delays(
     if len(found) < len(points) or ("delay" not in kinds and still):
         return estimator, local
     pairs = zip(found, points.experiments, strict=True)
-    cost = sum(_cost(*pair, sampling_time) for pair in pairs)
+    cost = sum(cost_with_delay(finding, *pair, sampling_time) for pair in pairs)
     if not cost < own:
         return estimator, local
-    delays = np.array([model.lti.input_delay for model in found]) / sampling_time
-    first = np.round(delays[0])
-    if not first.any() or (np.round(delays) != first).any():
+    delays = np.array([delay_in_samples(model, sampling_time) for model in found])
+    if not delays[0].any() or (delays != delays[0]).any():
         return estimator, local  # an LPV model has one
-    delay = first.astype(int).tolist()
+    delay = delays[0].tolist()
     told[:] = later
     before, after = (
         ", ".join(map(str, sorted({model.order for model in models})))
@@ -72,15 +71,6 @@ def with_delays(
         f"input_delay={[0] * len(delay)} to have none."
     )
     return finding, found
-
-
-def _cost(
-    model: LocalModel, experiments: Sequence[Experiment], sampling_time: float
-) -> float:
-    """The criterion of as many samples, whatever is unknown of the first ones."""
-    longest = float(model.lti.input_delay.max(initial=0.0)) / sampling_time
-    known = sum(len(e.rows) - longest for e in experiments)
-    return model.criterion * sum(len(e.rows) for e in experiments) / known
 
 
 def _is_to_have_none(estimator: Any) -> bool:

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 # Share of the squared errors that later inputs leave where the outputs lead them; or
 # where half the states are enough beside these, as for inputs that foretell themselves
 _LED, _NO_MORE = 0.1, 0.9
-_LINE = 3.0  # time constants per experiment of a mode that may be a reference's line
+_LINE = 1.0  # time constants per experiment of a mode that may be a reference's line
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; and for one with D free, where nothing but answers within the
