@@ -98,6 +98,7 @@ class Experiment:
     operating_point: Hashable = None  # label of the column with that role
     sampling_time: float | None = None  # seconds, of the time column; None without
     input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
+    output_names: tuple[Hashable, ...] = ()  # likewise; y1, y2, ... of arrays
     scheduling_names: tuple[Hashable, ...] = ()  # likewise
     breaks: tuple[int, ...] = ()  # samples before which time says that some are missing
     jitter: float = 0.0  # largest deviation from even time, relative to the step
@@ -228,6 +229,7 @@ def read_experiments(
             operating_point=operating_point_of(by_point, rows, label),
             sampling_time=clock.step,
             input_names=tuple(names),
+            output_names=tuple(y_names),
             scheduling_names=tuple(c.name for c in kappa),
             breaks=tuple(clock.breaks.tolist()),
             jitter=clock.jitter,
@@ -250,7 +252,7 @@ def are_beginnings(experiments: Sequence[Experiment]) -> list[bool]:
     return [first.setdefault(e.label, k) == k for k, e in enumerate(experiments)]
 
 
-def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
+def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Inputs with a last column that tells the experiments apart, and outputs."""
     u = np.vstack([e.inputs for e in experiments])
     y = np.vstack([e.measured for e in experiments])
@@ -262,7 +264,7 @@ def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
     table[label] = np.repeat(
         np.arange(len(experiments)), [len(e.rows) for e in experiments]
     )
-    return table, y
+    return table, pd.DataFrame(y, columns=list(experiments[0].output_names) or None)
 
 
 def check_inputs(experiments: Sequence[Experiment], n_inputs: int) -> None:

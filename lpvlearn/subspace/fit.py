@@ -32,6 +32,7 @@ from .diagnosis.cross_checks import tell_of_contradiction, tell_of_input_spikes
 from .diagnosis.faulty_outputs import (
     tell_of_drift,
     tell_of_dropouts,
+    tell_of_exchange,
     tell_of_held_outputs,
     tell_of_limits,
     tell_of_logging,
@@ -73,6 +74,7 @@ def fit_samples(
     samples, fitted, turns = without_oscillations(samples, fitted)
     fitted = without_modes_of_few_lines(samples, fitted)
     if not telling.silent:
+        tell_of_exchange(pairs, fitted, telling)
         tell_of_logging(pairs, fitted, telling)
         if not telling.spoilt:
             _tell_of_signals(outputs, samples, fitted)

@@ -41,10 +41,11 @@ def _record(seed, n_samples=1200, hold=1, noise=0.01):
     return u, y + noise * y.std() * rng.standard_normal(y.shape)
 
 
-def _told(u, y):
+def _told(u, y, **options):
+    options = options or {"order": 2, "method": "po-moesp", "horizon": 10}
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        SubspaceLTI(2, method="po-moesp", horizon=10).fit(u, y)
+        SubspaceLTI(**options).fit(u, y)
     return "\n".join(str(one.message) for one in told)
 
 
@@ -99,3 +100,17 @@ def test_an_angle_that_is_turned_back_is_told():
     for signal in (angle[:, 0], squares, u[:, 0]):
         assert wraps([signal], [u]) == 0
     assert wraps([wrapped[:, 0]], [wrapped]) == 0
+
+
+def test_inputs_and_outputs_that_are_exchanged_are_told():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], 200), 4)[:, None]
+    system = StateSpace([[1.6, -0.7], [1, 0]], [[1], [0]], [[0.1, 0]], None, 1)
+    y = system.simulate(u)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    told = _told(y, u, order="auto")
+    assert told.startswith("Output 1 takes 2 values only, as a command does")
+    assert "\n" not in told  # what else may be said comes of that
+    assert not _told(u, y, order="auto")
+    coarse = _told(u, np.round(y / y.std()), order="auto")
+    assert "exchanged" not in coarse  # a sensor of few steps

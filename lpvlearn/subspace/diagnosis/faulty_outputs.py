@@ -33,6 +33,10 @@ _DRIFTS = 0.1  # to either side, of the motion of the output
 
 _SOME = 3  # values that are listed
 
+# Values of an output that may be a command; times as many of a measured input; and
+# errors, relative to the outputs, of models of what an answer is taken for the cause of
+_COMMANDS, _MORE, _POOR = 8, 20, 0.3
+
 
 def tell_of_still_outputs(outputs: Sequence[Array], telling: Telling) -> None:
     """Tell of outputs that never change."""
@@ -127,6 +131,27 @@ def tell_of_logging(pairs: Pairs, fitted: LocalFit, telling: Telling) -> None:
                 "are kept within a revolution. Use `numpy.unwrap`, with the `period` "
                 "of its unit, for every experiment.",
             )
+
+
+def tell_of_exchange(pairs: Pairs, fitted: LocalFit, telling: Telling) -> None:
+    """Tell of outputs that take few values beside inputs that do not, as commands do.
+
+    None that a linear model explains.
+    """
+    if "exchanged" in telling or fitted.residual < _POOR:
+        return
+    u, y = (np.concatenate(signals) for signals in zip(*pairs, strict=True))
+    n_outputs = [len(np.unique(column)) for column in y.T]
+    n_inputs = [len(np.unique(column)) for column in u.T]
+    most, least = max(n_outputs), min(n_inputs)
+    if most <= _COMMANDS and least >= _MORE * most:
+        names = telling.output(int(np.argmax(n_outputs))), telling.input(0)
+        telling.once(
+            "exchanged",
+            f"Output {names[0]} takes {most} values only, as a command does, and "
+            f"input {names[1]} takes {n_inputs[0]}: inputs and outputs seem to be "
+            "exchanged. Give what moves the system as `X`, and what answers as `y`.",
+        )
 
 
 def tell_of_limits(
