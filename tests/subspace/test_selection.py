@@ -126,6 +126,28 @@ def test_parts_that_no_order_explains_do_not_refute_one(monkeypatch, bft, order)
     assert chosen.order == order
 
 
+@pytest.mark.parametrize("certain, order", [(selection.CERTAIN, 3), (np.inf, 2)])
+def test_less_beside_common_unknowns_does_not_refute_what_is_far_likelier(
+    monkeypatch, certain, order
+):
+    """A slow free motion of the likelier order hides that its own errors are less."""
+    time = np.arange(40.0)[:, None]
+    slow, hum = np.sin(0.1 * time) + np.zeros(2), 0.1 * np.cos(2.0 * time) * np.ones(2)
+
+    def validate(candidate, records, settings):
+        rich = len(candidate.model.A) == 3
+        error = hum if rich else 0.5 * hum + 0.1 * slow
+        free = slow[:, :, None] * np.eye(2) if rich else np.zeros((40, 2, 0))
+        part = Part(error, free, np.eye(2))
+        total = float((part.without(free) ** 2).sum())
+        return HeldOut([part], 20.0, total)
+
+    monkeypatch.setattr(selection, "validate", validate)
+    monkeypatch.setattr(selection, "CERTAIN", certain)
+    chosen = select([coloured(0, 600)], None, None, Settings(freedom(2, 1)))
+    assert chosen.order == order
+
+
 def _ladder(n_stages):
     """Chains of coils and capacitors, with a resistor at the end."""
     A = np.zeros((2 * n_stages, 2 * n_stages))

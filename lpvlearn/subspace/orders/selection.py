@@ -27,6 +27,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..evidence.constants import CERTAIN
 from ..evidence.rounding import rounded_outputs
 from ..evidence.statistics import Evidence
 from ..samples.records import Record, output_energy, thinned
@@ -312,9 +313,11 @@ def _search(
             own = _with_own_noise(far[order], records, wanted, settings)
             orders[order] = min(own, orders[order], key=_criterion)
         errors[order] = validate(orders[order].candidate, records, settings)
+        if not _shows(orders[order], errors[order], records):
+            continue
         share = 0.0 if order > best else MATTERS
-        tells = _shows(orders[order], errors[order], records)
-        if tells and errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
+        known = orders[chosen], errors[chosen]
+        if _refutes(*known, orders[order], errors[order], share):
             chosen = order
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)
@@ -328,6 +331,20 @@ def _is_beyond(
     n_values = sum(record.n_values for record in records)
     least = max(chosen.candidate.model.loss, error.residual**2 * n_values)
     return one.candidate.model.loss > _BEYOND * least
+
+
+def _refutes(
+    chosen: _Tried, error: HeldOut, other: _Tried, its: HeldOut, share: float
+) -> bool:
+    """Whether parts held out are simulated clearly better by another order.
+
+    What is far likelier is not refuted by errors that are larger themselves, and less
+    only beside what the unknowns of both explain.
+    """
+    surely = chosen.criterion < other.criterion - CERTAIN
+    if surely and its.total > error.total:
+        return False
+    return its.clearly_better_than(error, _DOUBT, share)
 
 
 def _shows(one: _Tried, error: HeldOut, records: Sequence[Record]) -> bool:
