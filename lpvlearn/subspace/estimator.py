@@ -357,10 +357,12 @@ class SubspaceLTI(ScoredFromRest):
     "auto" compares the plant of "pbsid" with other models on parts held out (growing
     modes are simulated backward), unless inputs follow from the past, as a few sines
     do. D is left free, or "po-moesp" taken, where that leaves less than half of the
-    squared errors, or makes a plant stable that is so within its uncertainty;
-    "po-moesp" with D free, where it leaves less than a tenth and outputs seem to know
-    later inputs, as filtered ones, or less than a quarter and nothing but answers
-    within the sample shows a loop, as noise of measured inputs makes them.
+    squared errors, or makes a plant stable that is so within its uncertainty; not
+    "po-moesp" where its best fit to these parts is below 50 % and it predicts worse, as
+    where noise moves a loop more than its reference does; "po-moesp" with D free, where
+    it leaves less than a tenth and outputs seem to know later inputs, as filtered ones,
+    or less than a quarter and nothing but answers within the sample shows a loop, as
+    noise of measured inputs makes them.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.

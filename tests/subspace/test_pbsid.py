@@ -371,6 +371,31 @@ def modes_sampled_early(seed, n_samples=500):
     return u[:-1], y + 0.005 * y.std() * rng.standard_normal(y.shape)
 
 
+def loaded_loop(seed, n_samples=1500):
+    """A lag under a PI controller, moved more by its load than by what is added."""
+    rng = np.random.default_rng(seed)
+    added = np.repeat(rng.choice([-1.0, 1.0], n_samples // 5), 5)
+    load = lfilter([1.0], [1.0, -0.8], rng.standard_normal(n_samples))
+    x, total, u, y = 0.0, 0.0, np.zeros(n_samples), np.zeros(n_samples)
+    for t in range(n_samples):
+        y[t] = x
+        if t:
+            total -= y[t - 1]
+            u[t] = added[t] - 1.5 * y[t - 1] + 0.1 * total
+        x = 0.8 * x + 0.2 * (u[t] + load[t])
+    return u[:, None], y[:, None]
+
+
+@pytest.mark.broad
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_inputs_that_tell_the_noise_do_not_refute_the_plant(seed):
+    """By them a model without states simulates parts held out clearly better."""
+    u, y = loaded_loop(seed)
+    with pytest.warns(UserWarning, match="closed loop.*'pbsid' was taken"):
+        model = SubspaceLTI().fit(u, y)
+    assert_allclose(model.lti_.dc_gain(), 1.0, rtol=0.25)
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The outputs seem to know")
 def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop():

@@ -35,6 +35,10 @@ _LINE = 1.0  # time constants per experiment of a mode that may be a reference's
 _OF_NOISE = 0.5
 _OF_ANSWERS = 0.25
 
+# Best fit of parts held out, percent, that leaves a quarter of their energy: below it
+# noise may be what moves the loop
+_NOISY = 50.0
+
 _FASTEST = 2.0  # growth within a sample of a plant that no controller holds
 
 # Share of the first model's squared errors on parts held out that one of more states,
@@ -70,7 +74,10 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
     refute the plant unless inputs were to be noise more than anything else
     (`_OF_NOISE`), and how they act at once was not said, nor shown by a controller that
     answers at once; or the plant is unstable, by no more than chance, and the other is
-    not; or D was left free for a stable plant, but fits these parts no better.
+    not; or D was left free for a stable plant, but fits these parts no better. Inputs
+    are noise more than anything else where it moves the loop more than what is added to
+    it: where the other explains little of these parts (`_NOISY`), it must not predict
+    worse for certain, as outputs tell their noise before the inputs do.
     """
     choices, n_trend = samples.choices, first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
@@ -96,7 +103,8 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         if (order := open_loop.selection.order) != first.selection.order:
             free = False if without_d else choices.feedthrough
             other, found = rival(method="pbsid", order=order, feedthrough=free)
-            if found.clearly_better_than(error, DOUBT):
+            better = found.clearly_better_than(error, DOUBT)
+            if better and _may_refute(first, other, found):
                 tried = other.selection.among(first.selection)
                 first = best = other._replace(selection=tried)
                 before = error = found
@@ -123,6 +131,7 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         if not said and not best.grows() and of_that.total < _LED * error.total:
             # inputs were made of later outputs, too
             unsure |= find_lead(samples.pairs)[0] > 0
+        better &= unsure or _may_refute(best, blind, of_blind)
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
             better = of_that.clearly_better_than(error, DOUBT)
@@ -146,6 +155,15 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         same = samples.having(method=best.method, feedthrough=free)
         best = with_trends(same, best)
     return best, doubt
+
+
+def _may_refute(first: LocalFit, other: LocalFit, error: HeldOut) -> bool:
+    """Whether another model's error on parts held out tells against the first one.
+
+    What the inputs tell of the noise, outputs told before: where little else is
+    explained, who simulates better by it must not predict worse for certain.
+    """
+    return error.bft > _NOISY or _deviance(other) < _deviance(first) + CERTAIN
 
 
 def _alternates(fitted: LocalFit) -> bool:
