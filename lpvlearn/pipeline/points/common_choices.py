@@ -214,13 +214,17 @@ def _with_one_delay(
         known[tuple(delay.tolist())] = models
         return estimator, models
 
-    def cost(delay: NDArray[np.intp], limit: float = np.inf) -> float:
-        """Or infinity, where a point alone shows that it is beyond a limit."""
-        for points in ([min(own)], list(own)):
+    def cost(delay: NDArray[np.intp], former: NDArray[np.intp] | None = None) -> float:
+        """Or infinity, where the first point is far likelier with a former delay.
+
+        One that all points have is far worse for none of them.
+        """
+        first, limit = min(own), np.inf
+        if former is not None:
+            limit = costs_of(having(former, [])[1])[first] + _CLEARER * len(own)
+        for points in ([first], list(own)):
             costs = costs_of(having(delay, points)[1])
-            if any(k not in costs for k in points):
-                return np.inf
-            if not sum((own | costs).values()) < limit + _CLEARER * len(own):
+            if any(k not in costs for k in points) or costs[first] > limit:
                 return np.inf
         return sum(costs.values())
 
@@ -234,7 +238,7 @@ def _with_one_delay(
     inputs, outputs = groups[0][0].inputs.shape[1], groups[0][0].measured.shape[1]
     state = len(own) * PRICE * (inputs + outputs)
     far_apart = bool((np.ptp(delays, axis=0) > _CHANCE).any())
-    least = cost(delay, least_of_own if far_apart else np.inf)
+    least = cost(delay, delays[0] if far_apart else None)
     if np.isinf(least):
         return local, found
     for sample in np.eye(len(delay), dtype=np.intp):
@@ -272,7 +276,7 @@ def _along(
     step: NDArray[np.intp],
     worth: float,
     start: tuple[NDArray[np.intp], float],
-    cost: Callable[[NDArray[np.intp], float], float],
+    cost: Callable[[NDArray[np.intp], NDArray[np.intp]], float],
 ) -> tuple[NDArray[np.intp], float]:
     """The delay of least cost some steps from a start, where that is `worth` it.
 
@@ -281,7 +285,7 @@ def _along(
     delay, least = start
     best, lowest, other = start, least - worth, delay + step
     while (other >= 0).all():
-        reached = cost(other, least + _CLEARER)
+        reached = cost(other, other - step)
         if not reached < least + _CLEARER:
             break
         if reached < lowest:
