@@ -10,7 +10,7 @@ from numpy.random import Generator, RandomState
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
-from ..validation import number, real_array, shown
+from ..validation import number, positive_time, real_array, shown
 from .excitation import (
     MOST_BITS,
     check_count,
@@ -178,6 +178,7 @@ def make_flexible_arm(
     if not isinstance(arm, FlexibleArm):
         raise ValueError(f"`arm` must be a FlexibleArm or None. Got {shown(arm)}.")
     theta2 = np.pi * np.arange(1, n_points + 1) / (n_points + 1)
+    sampling_time = positive_time("sampling_time", sampling_time)
     n_samples = samples_of("duration", duration, sampling_time)
     n_sweep = samples_of("sweep_duration", sweep_duration, sampling_time)
     check_rows(

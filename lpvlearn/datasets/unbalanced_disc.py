@@ -12,7 +12,14 @@ from sklearn.utils import Bunch
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import naming_argument, number, real_array, shown, squarable
+from ..validation import (
+    naming_argument,
+    number,
+    positive_time,
+    real_array,
+    shown,
+    squarable,
+)
 from .excitation import (
     check_count,
     check_rows,
@@ -333,6 +340,7 @@ def make_unbalanced_disc(
         raise ValueError(
             f"`disc` must be an UnbalancedDisc or None. Got {shown(disc)}."
         )
+    sampling_time = positive_time("sampling_time", sampling_time)
     n_samples = samples_of("duration", duration, sampling_time)
     n_large = samples_of("large_duration", large_duration, sampling_time)
     bit = samples_of("clock", clock, sampling_time)

@@ -204,7 +204,8 @@ def begin_held(beginnings: Iterable[Beginning]) -> bool:
     if not records or not all(np.isfinite(a).all() for a in apart):
         return False
     size = np.max([np.abs(a).max(axis=0, initial=0.0) for a in apart], axis=0)
-    weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    known = size > np.finfo(float).tiny
+    weight = np.divide(1.0, size, out=np.zeros_like(size), where=known)
     nearer = worse = total = 0.0
     for one, a in zip(records, apart, strict=True):
         to_rest, to_mean, to_held = (

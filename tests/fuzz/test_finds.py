@@ -1,5 +1,6 @@
 """What fuzzing found, by class: each was a wrong result, a hang or a riddle."""
 
+import warnings
 from decimal import Decimal
 from fractions import Fraction
 
@@ -475,3 +476,24 @@ def test_an_output_error_model_that_grows_within_its_range_is_told():
 def test_sequences_that_no_memory_holds_are_refused():
     with pytest.raises(ValueError, match="`n_samples` .* `n_channels`"):
         prbs(1_000_000, n_channels=1_000_000)
+
+
+def test_numbers_near_the_smallest_make_no_warning_of_numpy():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], 60), 3)[:, None]
+    rates = lp.StateSpace([[-1.0]], [[1.0]], [[1.0]]).simulate(u, sampling_time=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", UserWarning)
+        lp.SubspaceLTI(sampling_time=0.1, integrating=True).fit(
+            u, 1e-203 * np.cumsum(rates, axis=0)
+        )
+        lp.SubspaceLTI().fit(u, np.full((180, 1), 1e-320))
+
+
+def test_simulated_sampling_times_may_be_fractions():
+    third = Fraction(1, 3)
+    disc = lp.datasets.make_unbalanced_disc(
+        2, duration=4, large_duration=2, sampling_time=third, clock=third
+    )
+    assert disc.sampling_time == float(third)

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
-from lpvlearn.subspace.closed_loop.answers import answering_input
+from lpvlearn.subspace.closed_loop.answers import _steps, answering_input
 
 # numerator and denominator of the controller's law
 LAWS = {
@@ -122,3 +122,11 @@ def test_a_white_input_of_few_samples_is_designed(n_samples):
 def test_too_few_samples_tell_no_law():
     u, y = regulated(n_samples=30)
     assert answering_input([(u, y)]) is None
+
+
+def test_small_units_are_no_rounding():
+    """Metres for micrometres: all moves are far less than a decimal."""
+    signal = np.random.default_rng(0).standard_normal((300, 1))
+    assert _steps([1e-6 * signal]) == _steps([signal]) == [0.0]
+    (twelfth,) = _steps([np.round(1e-3 * signal.cumsum(axis=0), 4)])
+    np.testing.assert_allclose(twelfth, 1e-8 / 12.0)

@@ -51,6 +51,8 @@ _DECIMALS, _NEAR = 9, 1e-3  # places of numbers that are rounded; of a step, how
 _LEVELS, _HELD = 16, 0.5
 _FORESEEN, _BY_CHANCE = 0.02, 4.0
 
+_SQUARABLE = 1e-150  # size of an output below which its square may be no number
+
 
 class _Windows(NamedTuple):
     """A column for every sample with as long a past, less means of the experiments."""
@@ -150,10 +152,11 @@ def _steps(signals: list[Array]) -> list[float]:
         moves = np.concatenate([np.diff(v) for v in values])
         largest = max(float(np.abs(v).max()) for v in values)
         step = 0.0
+        least = largest * np.finfo(float).eps / _NEAR
         for decimal in 10.0 ** -np.arange(_DECIMALS):
-            multiples = moves / decimal
+            multiples = np.abs(moves / decimal)
             near = np.abs(multiples - np.round(multiples)).max() < _NEAR
-            if near and decimal > largest * np.finfo(float).eps / _NEAR:
+            if near and multiples.max() > 0.5 and decimal > least:
                 step = decimal
                 break
         single = all((v == v.astype(np.float32)).all() for v in values)
@@ -182,8 +185,10 @@ def _is_answer(
     floor = _EXACT * float(np.std(u[0]))
     changes = -np.diff(u, axis=0)
     for i, first in product(range(windows.outputs.shape[1]), (0, 1)):
-        y = windows.outputs[first:, i]
-        sizes = own_step, steps[i]
+        size = max(float(np.abs(windows.outputs[:, i]).max()), _SQUARABLE)
+        unit = np.exp2(np.frexp(size)[1] - 1)
+        y = windows.outputs[first:, i] / unit
+        sizes = own_step, steps[i] / unit / unit
         for lags in range(_LONGEST):
             row = changes[:lags] if lags else u[:1]
             left, rounding = _law(row, y[: lags + 1], *sizes, changes=lags > 0)
