@@ -32,7 +32,7 @@ from ..data.operating_points import (
     without_spikes,
 )
 from ..data.preparation import has_gaps, split_at_gaps
-from ..data.tables import as_list, read_outputs
+from ..data.tables import as_list
 from ..data.timestamps import TIME_TOL
 from ..exceptions import (
     Told,
@@ -527,7 +527,7 @@ list, default=None
         """The experiments of a table to be fitted."""
         cut_at_outputs = not estimates_outputs(self.local)
         experiments = self._read(X, y, reset=True, outputs=cut_at_outputs, **options)
-        self.output_names_ = read_outputs(y)[1]
+        self.output_names_ = list(experiments[0].output_names)
         self._remember_shape(y)
         return experiments
 

@@ -638,7 +638,7 @@ class SubspaceLTI(ScoredFromRest):
         experiments = self._read(X, y, reset=True)
         self.time_jitter_ = max(e.jitter for e in experiments)
         self._remember_shape(y)
-        flags = integrating_flags(self.integrating, read_outputs(y)[1])
+        flags = integrating_flags(self.integrating, experiments[0].output_names)
         step = self._step_of(experiments)
         moved = rates_of(experiments, flags, float(step))
         table, rates = as_table(moved)
@@ -1395,7 +1395,8 @@ def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
     inputs = experiments[0].input_names
     numbered = any(isinstance(name, Integral) for name in inputs)
     named = hasattr(y, "columns") or getattr(y, "name", None) is not None
-    return None if numbered else inputs, read_outputs(y)[1] if named else None
+    outputs = list(experiments[0].output_names) if named else None
+    return None if numbered else inputs, outputs
 
 
 def _labels_of(X: Any, experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:

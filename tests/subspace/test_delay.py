@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.models.innovation import InnovationModel, NoiseModel
+from lpvlearn.subspace.fits import delay as delays
 from lpvlearn.subspace.fits.delay import find_delays, first_answers, late_inputs
 from lpvlearn.subspace.fits.options import Choices
 
@@ -467,3 +468,16 @@ def test_inputs_that_are_foretold_make_no_delay(seed, delay):
     omega = 2 * np.pi * f / 0.05
     G, G0 = (m.frequency_response(omega) for m in (found.lti_, model))
     assert np.linalg.norm(G - G0) < 0.01 * np.linalg.norm(G0)
+
+
+def test_answers_are_those_of_all_samples_at_once(monkeypatch):
+    """By factors of some at a time, which take the memory of these."""
+    rng = np.random.default_rng(0)
+    pairs = []
+    for n in (150, 90, 300):
+        u = rng.standard_normal((n, 2))
+        y = 0.3 * np.roll(u[:, :1], 4, axis=0) + np.roll(u[:, 1:], 1, axis=0)
+        pairs.append((u, y + 0.5 * rng.standard_normal((n, 1))))
+    at_once = first_answers(pairs, 10)
+    monkeypatch.setattr(delays, "_AT_ONCE", 40)
+    assert first_answers(pairs, 10).tolist() == at_once.tolist() == [4, 1]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lpvlearn import SubspaceLTI
 from lpvlearn.subspace.samples.records import (
     Record,
     centred,
@@ -60,3 +61,17 @@ def test_what_is_centred_comes_back_with_its_centres(rng, n_trend):
         np.testing.assert_allclose(y + trends.T @ centres.trends[k], pairs[k][1])
         np.testing.assert_allclose(u + centres.inputs[k], pairs[k][0])
     assert centred(pairs, 0, True)[0] is pairs
+
+
+def test_heads_of_records_know_how_long_these_are():
+    """Else all noise drifts over what is left of many short experiments."""
+    rng = np.random.default_rng(0)
+    records = [Record.of(*rng.standard_normal((2, 200, 1))) for _ in range(300)]
+    heads, share = shorten(records)
+    assert share == 0.5 and {head.n_samples for head in heads} == {100}
+    assert {head.n_samples + head.n_later for head in heads} == {200}
+    u, y = (np.concatenate([getattr(r, c).T for r in records]) for c in "uy")
+    y = y + np.vstack([[[0.0]], u[:-1]])
+    X = np.column_stack([u, np.repeat(np.arange(300.0), 200)])
+    model = SubspaceLTI(1, horizon=4, inputs=[0], experiment=1).fit(X, y)
+    assert model._evidence.longest == 200

@@ -33,7 +33,7 @@ from ..telling import Telling
 
 Array = NDArray[np.float64]
 
-_ENOUGH = 10_000  # samples that are looked at
+_ENOUGH = 4_000  # samples that are looked at
 
 _LONGEST, _PAST = 4, 20  # lags of a law; and of an input that tells itself
 

@@ -259,8 +259,8 @@ class Evidence:
 
     @property
     def longest(self) -> int:
-        """Samples of the longest record."""
-        return max(record.n_samples for record in self.records)
+        """Samples of the longest experiment, of which the records may be the heads."""
+        return max(record.n_samples + record.n_later for record in self.records)
 
     @property
     def one_step(self) -> Evidence:

@@ -63,6 +63,8 @@ _SHARE, _LARGEST_SHARE = 10, 5
 # error to be nearly white, and for the answers of systems of usual orders.
 _PAST = 12
 
+_AT_ONCE = 2_000  # samples whose windows are in memory
+
 _CHANCE = 1e-4  # probability by chance of an answer that is certain
 
 # No delay, with a state more, must be worse than several samples of delay by this, in
@@ -264,27 +266,35 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
     # No more unknowns than a quarter of the samples
     past = int(np.clip((n_samples / 4 - m * longest) / (m + ny), 1, _PAST))
     span = longest + past
-    long = [(u, y) for u, y in pairs if len(u) > span]
     found = np.full(m, -1)
-    if not long:
+    columns = 1 + past * ny + m * (span + 1)
+    R, n_rows = np.zeros((0, columns + ny)), 0
+    starts = [
+        (k, at)
+        for k, (u, _) in enumerate(pairs)
+        for at in range(0, len(u) - span, _AT_ONCE)
+    ]
+    waiting: list[Array] = []
+    for k, at in starts:
+        u, y = (z[at : at + _AT_ONCE + span] for z in pairs[k])
+        waiting.append(_windows(u, y, span, past))
+        n_rows += len(waiting[-1])
+        if sum(map(len, waiting)) >= _AT_ONCE or (k, at) == starts[-1]:
+            R = np.asarray(np.linalg.qr(np.vstack([R, *waiting]), mode="r"))
+            waiting = []
+    error = n_rows - columns
+    if error < 1:
         return found
-    window = np.lib.stride_tricks.sliding_window_view
-    inputs = np.concatenate([window(u, span + 1, axis=0) for u, _ in long])
-    outputs = [window(y[span - past : -1], past, axis=0) for _, y in long]
-    earlier = np.concatenate(outputs).reshape(len(inputs), -1)
-    y = np.concatenate([y[span:] for _, y in long])
+    squares = (R[:, columns:] ** 2).sum(axis=0)
+    least = _ROUNDING * squares + np.finfo(float).tiny
+    own = np.arange(span + 1)
     for j in range(m):
-        rest = np.delete(inputs, j, axis=1).reshape(len(inputs), -1)
-        own = inputs[:, j]  # the present last
-        X = np.column_stack([np.ones(len(y)), earlier, rest, own])
-        k = X.shape[1]
-        error = len(X) - k
-        if error < 1:
-            return found
-        R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"))
-        explained = R[k - longest - 1 : k, k:][::-1] ** 2
-        left = (R[k:, k:] ** 2).sum(axis=0)
-        least = _ROUNDING * (y**2).sum(axis=0) + np.finfo(float).tiny
+        # the input last, and its present last of it
+        at = columns - (m - j) * (span + 1) + own
+        order = np.r_[np.setdiff1d(np.arange(columns), at), at, columns : columns + ny]
+        T = np.asarray(np.linalg.qr(R[:, order], mode="r"))
+        explained = T[columns - longest - 1 : columns, columns:][::-1] ** 2
+        left = (T[columns:, columns:] ** 2).sum(axis=0)
         left = np.maximum(left, least) / error
         count = np.arange(1, longest + 2)[:, None]
         F = np.cumsum(explained, axis=0) / count / left
@@ -292,6 +302,15 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
         if certain.any():
             found[j] = np.argmax(certain)
     return found
+
+
+def _windows(u: Array, y: Array, span: int, past: int) -> Array:
+    """One, past outputs, inputs by channel with the present last, and outputs."""
+    window = np.lib.stride_tricks.sliding_window_view
+    n = len(u) - span
+    inputs = window(u, span + 1, axis=0).reshape(n, -1)
+    earlier = window(y[span - past : -1], past, axis=0).reshape(n, -1)
+    return np.hstack([np.ones((n, 1)), earlier, inputs, y[span:]])
 
 
 def find_lead(pairs: Pairs) -> tuple[int, int]:

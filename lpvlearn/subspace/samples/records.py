@@ -32,6 +32,7 @@ class Record(NamedTuple):
     trend: Array = np.zeros((0, 0))  # (n_trend, n_samples), free in every output
     # (n_outputs, n_samples): outputs that were missing, and are estimates; empty: none
     missing: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+    n_later: int = 0  # samples of the experiment that come after these
 
     @classmethod
     def of(cls, u: Array, y: Array, n_trend: int = 0) -> Record:
@@ -82,7 +83,11 @@ def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
     share = _MAX_SAMPLES / total
     if share >= 1.0:
         return list(records), 1.0
-    parts = [r.head(max(2, int(share * r.n_samples))) for r in records]
+    parts = []
+    for r in records:
+        head = r.head(max(2, int(share * r.n_samples)))
+        later = r.n_later + r.n_samples - head.n_samples
+        parts.append(head._replace(n_later=later))
     return parts, sum(record.n_samples for record in parts) / total
 
 

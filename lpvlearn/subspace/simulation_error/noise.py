@@ -150,7 +150,7 @@ class Whitening(NamedTuple):
         lost = len(self.filter) - 1
         first = lost if free.initial_states else 0
         out = []
-        for u, y, trend, missing in records:
+        for u, y, trend, missing, _ in records:
             if u.shape[1] > 2 * lost:
                 if lost:
                     u, y, trend = (
