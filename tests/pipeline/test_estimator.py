@@ -26,6 +26,7 @@ from lpvlearn import (
 from lpvlearn.datasets import make_unbalanced_disc
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.pipeline.estimator import Stopwatch
+from lpvlearn.subspace.streams import stream
 
 from ..conftest import (
     KAPPA,
@@ -954,3 +955,11 @@ def test_what_spoils_a_record_is_told_alone(spoilt):
     assert cause in first
     known = "`lpv_` is unstable", "If a sensor got them wrong"
     assert [other for other in others if not any(k in other for k in known)] == []
+
+
+def test_points_longer_than_the_buffer_become_one_model(monkeypatch):
+    """Sums of their samples stand for all experiments but the first of each."""
+    monkeypatch.setattr(stream, "BUFFER", 700)
+    X, y = spring_tables(noise=0.01, n_samples=300, n_repeats=4)
+    pipeline = spring_pipeline(local=SubspaceLTI(2, horizon=8)).fit(X, y)
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=0.02)

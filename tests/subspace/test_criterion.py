@@ -72,3 +72,15 @@ def test_a_model_tells_its_criterion(tmp_path):
     assert np.isnan(integrating.criterion())
     save(none, tmp_path / "model.zip")
     assert np.isnan(load(tmp_path / "model.zip").criterion())
+
+
+def test_a_model_of_sums_has_the_criterion_of_its_first_samples(short_buffer):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((2_400, 1))
+    y = lfilter([0.0, 1.0], [1.0, -0.8], u, axis=0)
+    y += 0.1 * rng.standard_normal(y.shape)
+    X = np.column_stack([u, np.arange(2_400) // 300])
+    roles = {"inputs": [0], "experiment": 1}
+    found = SubspaceLTI(1, horizon=8, **roles).fit(X, y).criterion()
+    first = SubspaceLTI(1, horizon=8, **roles).fit(X[:1_000], y[:1_000]).criterion()
+    assert found == pytest.approx(first, abs=20.0)

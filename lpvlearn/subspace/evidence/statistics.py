@@ -255,7 +255,10 @@ class Evidence:
             return -np.inf  # nothing is left of it, and its scale tells nothing
         n_samples = sum(record.n_samples for record in records)
         units = 2.0 * n_samples * float(np.log(self.output_scale).sum())
-        return units + criterion_of(self.model, records, self.free)
+        model = self.model  # of a stream: it begins as the last of its experiments
+        if len(model.initial_states) != len(records):
+            model = self.begun_in(records)
+        return units + criterion_of(model, records, self.free)
 
     @property
     def longest(self) -> int:
