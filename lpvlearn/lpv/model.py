@@ -207,12 +207,13 @@ class LPVStateSpace(VersionedPickle):
                 "`scheduling_range` must be finite, of shape (2, n_scheduling), "
                 f"smallest values first. Got {bounds.tolist()}."
             )
-        limits = self.identified_range
-        if limits is not None and np.shape(limits) != bounds.shape:
-            raise ValueError(
-                "`identified_range` must have the shape of `scheduling_range`, "
-                f"{bounds.shape}. Got {np.shape(limits)}."
-            )
+        if self.identified_range is not None:
+            limits = real_array("identified_range", self.identified_range)
+            if limits.shape != bounds.shape:
+                raise ValueError(
+                    "`identified_range` must have the shape of `scheduling_range`, "
+                    f"{bounds.shape}. Got {limits.shape}."
+                )
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
         object.__setattr__(self, "n_scheduling", bounds.shape[1])

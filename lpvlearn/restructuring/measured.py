@@ -16,6 +16,7 @@ from ..systems.hinf_norm import PeakSet
 from ..systems.response import resolvent
 from ..systems.sampling import d2c_tustin
 from ..validation import (
+    SQUARED,
     complex_array,
     real_array,
     shown,
@@ -151,6 +152,11 @@ def read_frequency_data(
         raise ValueError(
             "`omega` must be finite, not negative, and not only zero. Got "
             f"{grid.min():.4g} to {grid.max():.4g}." + _OF_SAMPLES
+        )
+    if (least := grid[grid > 0].min()) < 1.0 / SQUARED:
+        raise ValueError(
+            f"`omega` must hold zero or numbers of at least {1.0 / SQUARED:g}, as they "
+            f"are squared. Got {least:.4g}; take another unit."
         )
     if len(np.unique(grid)) != len(grid):
         raise ValueError(f"`omega` must hold every frequency once. Got {shown(omega)}.")

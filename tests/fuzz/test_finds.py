@@ -282,7 +282,7 @@ HUGE = np.full((4, 2), 1e308)
         (
             "GrayBoxRestructurer.fit(noise)",
             {"omega": [1e-201, 1e-200, 1e-199]},
-            "no stable starting point",
+            "`omega` must hold zero or numbers of at least",
         ),
     ],
 )
@@ -497,3 +497,15 @@ def test_simulated_sampling_times_may_be_fractions():
         2, duration=4, large_duration=2, sampling_time=third, clock=third
     )
     assert disc.sampling_time == float(third)
+
+
+def test_ragged_ranges_and_frequencies_without_squares_are_told():
+    lpv = world().lpv
+    with pytest.raises(ValueError, match="`identified_range` must"):
+        lp.LPVStateSpace(
+            lpv.structure, lpv.interpolator, lpv.scheduling_range,
+            identified_range=[[1], [1, 2]],
+        )  # fmt: skip
+    lag = lp.GrayBoxStructure.from_template([["-a"]], [["b"]], [[1.0]])
+    with pytest.raises(ValueError, match="`omega` must hold zero or numbers of at"):
+        lp.GrayBoxRestructurer(lag).fit([0.1, 1e-320, 10.0], np.ones((3, 2)))
