@@ -134,9 +134,8 @@ def spawn_generators(
     return [np.random.default_rng(seed) for seed in seeds]
 
 
-def samples_of(name: str, duration: float, sampling_time: float) -> int:
-    """Number of samples in a duration."""
-    dt = positive_time("sampling_time", sampling_time)
+def samples_of(name: str, duration: float, dt: float) -> int:
+    """Number of samples in a duration, of a sampling time that was checked."""
     rule = f"finite and at least `sampling_time` ({dt} s)"
     return check_count(name, float(np.rint(number(name, duration, rule, low=dt) / dt)))
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..data.experiments import NO_TIME, Experiment, are_beginnings
 from ..data.operating_points import check_outputs, without_spikes
-from ..data.tables import read_outputs
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold
 from ..lpv.bands import left_out_errors
@@ -278,7 +277,7 @@ class OutputErrorLPV(ScheduledEstimator):
         """
         self._check_options()
         experiments = without_spikes(self._read(X, y, reset=True))
-        names = read_outputs(y)[1]
+        names = list(experiments[0].output_names)
         check_outputs(experiments, names)
         self._remember_shape(y)
         self.output_names_, self.n_outputs_ = names, len(names)

@@ -24,7 +24,7 @@ from ..data.experiments import (
 )
 from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
 from ..data.scoring import ScoredFromRest
-from ..data.tables import Table, n_rows_of, read_outputs
+from ..data.tables import Table, n_rows_of
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel
@@ -1153,7 +1153,7 @@ class SubspaceLTI(ScoredFromRest):
         check_kind(errors)
         y = align_outputs(X, y, self)
         experiments = self._read(X, y, split=True, cut=False)
-        names = [] if y is None else read_outputs(y)[1]
+        names = list(experiments[0].output_names)
         if y is not None and len(names) != self.n_outputs_:
             raise ValueError(
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "

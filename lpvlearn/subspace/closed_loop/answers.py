@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ...data.preparation import Pairs
 from ...systems.least_squares import scaled_lstsq
+from ...validation import SQUARED
 from ..evidence.constants import CERTAIN
 from ..evidence.rounding import Rounding
 from ..samples.records import Record
@@ -50,8 +51,6 @@ _DECIMALS, _NEAR = 9, 1e-3  # places of numbers that are rounded; of a step, how
 # and of what its past foresees, beyond so many standard deviations of what chance does
 _LEVELS, _HELD = 16, 0.5
 _FORESEEN, _BY_CHANCE = 0.02, 4.0
-
-_SQUARABLE = 1e-150  # size of an output below which its square may be no number
 
 
 class _Windows(NamedTuple):
@@ -185,7 +184,7 @@ def _is_answer(
     floor = _EXACT * float(np.std(u[0]))
     changes = -np.diff(u, axis=0)
     for i, first in product(range(windows.outputs.shape[1]), (0, 1)):
-        size = max(float(np.abs(windows.outputs[:, i]).max()), _SQUARABLE)
+        size = max(float(np.abs(windows.outputs[:, i]).max()), 1.0 / SQUARED)
         unit = np.exp2(np.frexp(size)[1] - 1)
         y = windows.outputs[first:, i] / unit
         sizes = own_step, steps[i] / unit / unit

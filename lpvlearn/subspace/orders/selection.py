@@ -315,9 +315,8 @@ def _search(
         errors[order] = validate(orders[order].candidate, records, settings)
         if not _shows(orders[order], errors[order], records):
             continue
-        share = 0.0 if order > best else MATTERS
-        known = orders[chosen], errors[chosen]
-        if _refutes(*known, orders[order], errors[order], share):
+        (one, error), (other, its) = ((orders[k], errors[k]) for k in (chosen, order))
+        if _refutes(one, error, other, its, 0.0 if order > best else MATTERS):
             chosen = order
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)

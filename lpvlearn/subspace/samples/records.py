@@ -63,8 +63,10 @@ class Record(NamedTuple):
         return Record(u, y, trend, self.missing[:, samples])
 
     def head(self, n_samples: int) -> Record:
-        """The first samples."""
-        return self.part(slice(n_samples))
+        """The first samples, which know how many come after them."""
+        head = self.part(slice(n_samples))
+        later = self.n_later + self.n_samples - head.n_samples
+        return head._replace(n_later=later)
 
 
 def output_energy(records: Sequence[Record]) -> float:
@@ -83,11 +85,7 @@ def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
     share = _MAX_SAMPLES / total
     if share >= 1.0:
         return list(records), 1.0
-    parts = []
-    for r in records:
-        head = r.head(max(2, int(share * r.n_samples)))
-        later = r.n_later + r.n_samples - head.n_samples
-        parts.append(head._replace(n_later=later))
+    parts = [r.head(max(2, int(share * r.n_samples))) for r in records]
     return parts, sum(record.n_samples for record in parts) / total
 
 
