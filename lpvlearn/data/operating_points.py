@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
@@ -381,27 +380,38 @@ def group_operating_points(
 
 def _tolerance(
     signals: Sequence[Array], means: Array, tol: ArrayLike | None
-) -> tuple[Array, Array]:
-    """Of every pair of experiments (n, n, n_scheduling), and the largest."""
-    if tol is None:
-        spreads = _spreads(signals)
-        close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
-        wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
-        size = np.abs(means)
-        of_size = _CLOSE * np.maximum(size[:, None, :], size[None, :, :])
-        of_size = np.maximum(of_size, _ROUNDING * np.ptp(means, axis=0))
-        near = np.where(wider > 0.0, close, np.minimum(close, of_size))
-        return np.maximum(near, np.minimum(wider, usual)), np.maximum(close, usual)
-    largest = tolerances("scheduling_tol", tol, means.shape[1])
-    return largest, largest
+) -> tuple[Callable[[int], Array], Array]:
+    """From one experiment to every other (n, n_scheduling), and the largest."""
+    if tol is not None:
+        largest = tolerances("scheduling_tol", tol, means.shape[1])
+        return lambda _: largest, largest
+    spreads, span, size = _spreads(signals), np.ptp(means, axis=0), np.abs(means)
+    close, usual = _CLOSE * span, np.median(spreads, axis=0)
+
+    def near(k: int) -> Array:
+        wider = np.maximum(spreads, spreads[k])
+        of_size = np.maximum(_CLOSE * np.maximum(size, size[k]), _ROUNDING * span)
+        narrow = np.where(wider > 0.0, close, np.minimum(close, of_size))
+        return np.maximum(narrow, np.minimum(wider, usual))
+
+    return near, np.maximum(close, usual)
 
 
-def _cluster(means: Array, near: Array, tol: Array) -> NDArray[np.intp]:
+def _cluster(
+    means: Array, near: Callable[[int], Array], tol: Array
+) -> NDArray[np.intp]:
     """Group means that are as `near`, `tol` at most, whatever their order."""
-    distance = np.abs(means[:, None, :] - means[None, :, :])
-    joined = csr_array((distance <= near).all(axis=2))
-    _, group = connected_components(joined, directed=False)
-    for k in range(group.max() + 1):
+    group, n_groups = np.full(len(means), -1), 0
+    for first in range(len(means)):
+        reached = [first] if group[first] < 0 else []
+        n_groups += len(reached)
+        while reached:
+            k = reached.pop()
+            group[k] = n_groups - 1
+            joins = (np.abs(means - means[k]) <= near(k)).all(axis=1) & (group < 0)
+            group[joins] = n_groups - 1
+            reached.extend(np.flatnonzero(joins).tolist())
+    for k in range(n_groups):
         extent = np.ptp(means[group == k], axis=0)
         if (extent > _CHAIN * tol).any():
             j = int(np.argmax(extent - _CHAIN * tol))
@@ -412,7 +422,7 @@ def _cluster(means: Array, near: Array, tol: Array) -> NDArray[np.intp]:
                 "`scheduling_tol` (0: every experiment is a point), or label the "
                 "points with an `operating_point` column."
             )
-    return group.astype(np.intp)
+    return np.asarray(group)
 
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:

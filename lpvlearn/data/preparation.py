@@ -210,16 +210,14 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     >>> independent_inputs([np.hstack([u, u])]).shape
     (2, 1)
     """
-    stacked = np.vstack(inputs)
-    n_samples, n_inputs = stacked.shape
-    scale = np.abs(stacked).max(axis=0)
+    n_samples, n_inputs = sum(map(len, inputs)), inputs[0].shape[1]
+    scale = np.max([np.abs(u).max(axis=0) for u in inputs if len(u)], axis=0)
     scale[scale == 0.0] = 1.0  # of one that rests in these
-    gram = stacked / scale
     # Only a suspicion is checked on the samples themselves.
-    values = np.linalg.eigvalsh(gram.T @ gram)
+    values = np.linalg.eigvalsh(sum(v.T @ v for v in (u / scale for u in inputs)))
     if n_samples < n_inputs or values[0] > _SUSPECTED * values[-1]:
         return None
-    _, s, right = np.linalg.svd(np.linalg.qr(gram)[1])
+    _, s, right = np.linalg.svd(np.linalg.qr(np.vstack(inputs) / scale)[1])
     rank = int(np.sum(s > _COLLINEAR * s[0]))
     return None if rank == n_inputs else (right[:rank] / scale).T
 

@@ -14,9 +14,9 @@ g_s and the information H_s of the stretch among all of it, H.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import delayed as later
@@ -58,6 +58,11 @@ class Levels(NamedTuple):
     model_error: Array
     noise: Array
 
+    @property
+    def both(self) -> Array:
+        """Of both together."""
+        return np.asarray(np.hypot(self.model_error, self.noise))
+
 
 def simulation_std(model: LPVStateSpace, u: Array, kappa: Array, dt: float) -> Array:
     """Standard deviations (n_samples, n_outputs) of outputs simulated from rest.
@@ -75,7 +80,7 @@ def simulation_std(model: LPVStateSpace, u: Array, kappa: Array, dt: float) -> A
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of models that grow beyond all numbers
-def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels:
+def levels_of(errors: Iterable[Array], left_out: Iterable[Array] = ()) -> Levels:
     """Noise and model error behind simulation errors (n_samples, n_outputs) of records.
 
     The level of the quietest of eight bands of frequencies, and of those that are as
@@ -83,35 +88,46 @@ def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels
     own error: of the errors `left_out`, where there are any. Errors of records too
     short to tell are taken for that. Missing ones (NaN) are left out.
     """
-    total = _mean_square(errors)
-    powers: list[list[Array]] = [[] for _ in range(_BANDS)]
+    squares, powers = _MeanSquare(), [_MeanSquare() for _ in range(_BANDS)]
     for e in errors:
+        squares.add(e)
         known = ~np.isnan(e)
         window = np.hanning(len(e) + 1)[:-1, None] * known
-        ordinates = np.abs(np.fft.rfft(window * np.where(known, e, 0.0), axis=0)) ** 2
-        ordinates = ordinates[1:-1]
-        if len(ordinates) >= _BANDS and window.any(axis=0).all():
-            ordinates /= np.sum(window**2, axis=0)
-            parts = np.array_split(ordinates, _BANDS)
+        spectrum = np.fft.rfft(window * np.where(known, e, 0.0), axis=0)[1:-1]
+        if len(spectrum) >= _BANDS and window.any(axis=0).all():
+            amplitudes = np.abs(spectrum) / np.sqrt(np.sum(window**2, axis=0))
+            parts = np.array_split(amplitudes, _BANDS)
             for band, part in zip(powers, parts, strict=True):
-                band.append(part)
+                band.add(part)
+    total = squares.mean
     noise = np.zeros_like(total)
-    if powers[0]:
-        level = np.array([np.vstack(band).mean(axis=0) for band in powers])
-        spread = _ALIKE * _ORDINATE / np.sqrt(len(np.vstack(powers[0])))
+    if np.any(powers[0].n):
+        level = np.array([band.mean for band in powers])
+        spread = _ALIKE * _ORDINATE / np.sqrt(powers[0].n)
         quiet = level <= level.min(axis=0) * (1.0 + spread)
         noise = np.minimum(np.mean(level, axis=0, where=quiet), total)
     if left_out:
-        total = np.maximum(total, _mean_square(left_out))
+        beyond = _MeanSquare()
+        for e in left_out:
+            beyond.add(e)
+        total = np.maximum(total, beyond.mean)
     return Levels(np.sqrt(total - noise), np.sqrt(noise))
 
 
-def _mean_square(errors: Sequence[Array]) -> Array:
-    """Of every output, where it is known; NaN where it never is."""
-    e = np.vstack(errors)
-    n_known = np.count_nonzero(~np.isnan(e), axis=0)
-    mean: Array = np.nansum(e**2, axis=0) / np.where(n_known, n_known, np.nan)
-    return mean
+class _MeanSquare:
+    """Of every column of what is added, where it is known; NaN where it never is."""
+
+    def __init__(self) -> None:
+        self._sum: Any = 0.0
+        self.n: Any = 0  # of values that are known, of every column
+
+    def add(self, values: Array) -> None:
+        self._sum = self._sum + np.nansum(values**2, axis=0)
+        self.n = self.n + np.count_nonzero(~np.isnan(values), axis=0)
+
+    @property
+    def mean(self) -> Array:
+        return np.asarray(self._sum / np.where(self.n, self.n, np.nan))
 
 
 def left_out_errors(

@@ -77,6 +77,11 @@ def best_fit(true: Array, pred: Array, multioutput: Multioutput = "raw_values") 
     return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
 
+def fit_of_norms(error: Array, spread: Array) -> float:
+    """The mean BFT of outputs by the norms of errors, and of outputs about means."""
+    return float(_percent(error, spread, "uniform_average"))
+
+
 def vaf_score(
     y_true: ArrayLike,
     y_pred: ArrayLike,

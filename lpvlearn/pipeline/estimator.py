@@ -498,8 +498,10 @@ list, default=None
 
         Notes
         -----
-        Memory is that of the experiments of the largest operating point, times
-        `n_jobs`; with ``combine="average"`` of the largest experiment.
+        Memory is that of the largest experiment, and of 131,072 rows, times `n_jobs`.
+        It is that of the largest operating point in a closed loop, where the first rows
+        of a point tell too little of the others (see `SubspaceLTI.partial_fit`), with
+        `integrating` or `detrend`, and for local estimators of other classes.
 
         Examples
         --------

@@ -17,7 +17,7 @@ from ..data.experiments import NO_TIME, Experiment, are_beginnings
 from ..data.operating_points import check_outputs, without_spikes
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold
-from ..lpv.bands import left_out_errors
+from ..lpv.bands import left_out_errors, levels_of
 from ..lpv.interpolator import Interpolator
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
@@ -363,7 +363,7 @@ class OutputErrorLPV(ScheduledEstimator):
             prior = weighed.widened(more)
         labels = [e.label for e in experiments]
         groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
-        before = errors_along(start, experiments, records, own)
+        before = [*errors_along(start, experiments, records, own)]
         run = partial(results_of, n_jobs=self.n_jobs)
         with _progress(self.verbose) as tell:
             found = refine_with_rates(
@@ -405,13 +405,12 @@ class OutputErrorLPV(ScheduledEstimator):
             self.initial_states_[k, :n] = values[:n]
             if own.constant:
                 self.offsets_[k] = values[n:]
-        after = errors_along(self.lpv_, experiments, records, own)
+        after = [*errors_along(self.lpv_, experiments, records, own)]
         self.report_ = _report(labels, records, before, after)
         tell_of_errors(self.lpv_, records, after, own, start, prior, self.max_iter)
         self.output_errors_ = output_errors(
             start.output_names or range(1, start.n_outputs + 1),
-            after,
-            left_out_errors(found, records, own, run=run),
+            levels_of(after, left_out_errors(found, records, own, run=run)),
         )
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self

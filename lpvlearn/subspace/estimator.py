@@ -30,7 +30,7 @@ from ..exceptions import all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.threads import one_blas_thread
-from ..validation import frequencies, naming_argument, one_of
+from ..validation import frequencies, naming_argument, one_of, shown
 from .completion import completed, completed_by
 from .diagnosis.cross_checks import tell_of_delay
 from .diagnosis.fit_warnings import TESTS, warn_about, warn_about_pole
@@ -501,6 +501,47 @@ class SubspaceLTI(ScoredFromRest):
         telling = Telling(*(names or _labels_of(X, experiments, y)))
         if names:
             telling = telling.aside("noisy output", "useless", "dropouts")
+        self._fit_whole(experiments, choices, telling)
+        self._name(*_names_of(experiments, y))
+        return self
+
+    @all_or_nothing
+    def fit_experiments(self, experiments: Sequence[Experiment]) -> Self:
+        """As `fit`, of experiments that have been read.
+
+        Parameters
+        ----------
+        experiments : sequence of lpvlearn.data.experiments.Experiment
+            Which say what the columns of a table are: roles are not looked at. None of
+            their signals is copied as a whole where `fit` takes a table for a stream:
+            they may lie in a file (`numpy.memmap`).
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            As `fit`, and with `integrating`, which needs a table.
+        """
+        self._forget()
+        if self.integrating is not None:
+            raise ValueError(
+                "`integrating` must be None in fit_experiments. Got "
+                f"{shown(self.integrating)}. Use `fit`."
+            )
+        choices = check_options(self.get_params(deep=False))
+        names = _names_read(experiments)
+        self._single_output = False
+        self._fit_whole([*experiments], choices, Telling(*names))
+        self._name(*names)
+        return self
+
+    def _fit_whole(
+        self, experiments: list[Experiment], choices: Choices, telling: Telling
+    ) -> None:
+        """Identify the model of experiments in which samples may be missing."""
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             check_for_completion(self.detrend)
             experiments, choices = completed(
@@ -510,8 +551,6 @@ class SubspaceLTI(ScoredFromRest):
             warn_of_many_pieces(experiments)
         delay = self._delay_of(experiments, choices)
         self._identify(experiments, choices, delay, telling)
-        self._name(*_names_of(experiments, y))
-        return self
 
     def _learn(
         self,
@@ -574,16 +613,48 @@ class SubspaceLTI(ScoredFromRest):
         first = clone(self)
         experiments = first._read(X, y, reset=True, cut=False)
         first._remember_shape(y)
-        others = [copy(first) for _ in experiments[1:]]
-        delay = first._delay_of(experiments[:1], choices)
         telling = Telling(*_labels_of(X, experiments, y))
-        known = first._identify(experiments[:1], choices, delay, telling)
+        models = first._fit_apart(experiments, choices, telling)
+        for model in models:
+            model._name(*_names_of(experiments, y))
+        return models
+
+    def fit_each_experiment(self, experiments: Sequence[Experiment]) -> list[Self]:
+        """As `fit_each`, of experiments that have been read, as `fit_experiments`.
+
+        Parameters
+        ----------
+        experiments : sequence of lpvlearn.data.experiments.Experiment
+
+        Returns
+        -------
+        list of SubspaceLTI
+            Fitted clones, in the order of the experiments.
+
+        Raises
+        ------
+        ValueError
+            As `fit_each`.
+        """
+        choices = choices_of_each(self.get_params(deep=False))
+        first, names = clone(self), _names_read(experiments)
+        first._single_output = False
+        models = first._fit_apart([*experiments], choices, Telling(*names))
+        for model in models:
+            model._name(*names)
+        return models
+
+    def _fit_apart(
+        self, experiments: list[Experiment], choices: Choices, telling: Telling
+    ) -> list[Self]:
+        """This one, fitted to the first experiment, and copies for the others."""
+        others = [copy(self) for _ in experiments[1:]]
+        delay = self._delay_of(experiments[:1], choices)
+        known = self._identify(experiments[:1], choices, delay, telling)
         telling.kinds |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, telling, known)
-        for model in (first, *others):
-            model._name(*_names_of(experiments, y))
-        return [first, *others]
+        return [self, *others]
 
     @one_blas_thread
     def _identify(
@@ -1397,6 +1468,12 @@ def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
     named = hasattr(y, "columns") or getattr(y, "name", None) is not None
     outputs = list(experiments[0].output_names) if named else None
     return None if numbered else inputs, outputs
+
+
+def _names_read(experiments: Sequence[Experiment]) -> tuple[Any, Any]:
+    """Names of inputs and outputs, which experiments that were made may not have."""
+    first = experiments[0]
+    return list(first.input_names) or None, list(first.output_names) or None
 
 
 def _labels_of(X: Any, experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:

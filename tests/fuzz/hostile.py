@@ -1,6 +1,7 @@
 """Values that a caller may give by mistake, or by malice."""
 
 import tempfile
+import warnings
 from datetime import UTC, datetime
 from decimal import Decimal
 from fractions import Fraction
@@ -119,7 +120,9 @@ def hostile_array(draw, array):
 def _or_as_it_is(change, draw, value):
     """The changed value; where numpy or pandas know no such change, the value."""
     try:
-        return change(draw, value)
+        with warnings.catch_warnings():  # what they warn of is what is wanted
+            warnings.simplefilter("ignore")
+            return change(draw, value)
     except (
         TypeError,
         ValueError,

@@ -3,13 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import lfilter
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score, from_trajectories
+from lpvlearn.data.experiments import read_experiments
 from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
@@ -423,6 +424,35 @@ def test_an_experiment_unlike_the_first_is_fitted_on_its_own(rng):
     roles = {"experiment": "experiment", "scheduling": "kappa"}
     models = SubspaceLTI(3, refine="simulation", **roles).fit_each(X, y)
     assert_allclose(models[1].lti_.poles(), other.poles(), atol=1e-6)
+
+
+@pytest.mark.parametrize("missing", ["raise", "split", "estimate"])
+def test_experiments_that_were_read_have_the_model_of_their_table(rng, missing):
+    X, y = realizations(rng, 3)
+    if missing != "raise":
+        y.iloc[[50, 51, 700]] = np.nan
+    model = SubspaceLTI(3, missing=missing, experiment="experiment", scheduling="kappa")
+    whole = clone(model).fit(X, y)
+    read = read_experiments(clone(model), X, y, allow_missing="Xy")
+    found = clone(model).fit_experiments(read)
+    assert_array_equal(found.lti_.A, whole.lti_.A)
+    assert_array_equal(found.initial_states_, whole.initial_states_)
+    assert found.lti_.input_names == whole.lti_.input_names == ["u1"]
+
+
+def test_each_experiment_that_was_read_has_the_model_of_its_row(rng):
+    X, y = realizations(rng, 3)
+    model = SubspaceLTI(3, experiment="experiment", scheduling="kappa")
+    read = read_experiments(clone(model), X, y)
+    pairs = zip(model.fit_each(X, y), model.fit_each_experiment(read), strict=True)
+    for own, other in pairs:
+        assert_array_equal(other.lti_.A, own.lti_.A)
+        assert other.lti_.output_names == own.lti_.output_names
+    integrating = SubspaceLTI(3, integrating=True)
+    with pytest.raises(ValueError, match="None in fit_experiments. Got True. Use"):
+        integrating.fit_experiments(read)
+    with pytest.raises(ValueError, match="`integrating` must be None in fit_each"):
+        integrating.fit_each_experiment(read)
 
 
 def test_each_needs_outputs_that_do_not_integrate(rng):

@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from ...data.containers import row_labels
 from ...data.experiments import Experiment, naming
 from ...data.tables import n_rows_of
-from ...lpv.bands import levels_of, simulation_std
+from ...lpv.bands import Levels, simulation_std
 from ...lpv.model import LPVStateSpace
 
 Array = NDArray[np.float64]
 
 
-def output_errors(
-    names: Sequence[Hashable], errors: Sequence[Array], left_out: Sequence[Array] = ()
-) -> pd.DataFrame:
-    """Columns model_error and noise, a row per output, as `levels_of` has them."""
+def output_errors(names: Sequence[Hashable], levels: Levels) -> pd.DataFrame:
+    """Columns model_error and noise, a row per output."""
     index = pd.Index(list(names), name="output", tupleize_cols=False)
-    return pd.DataFrame(levels_of(errors, left_out)._asdict(), index)
+    return pd.DataFrame(levels._asdict(), index)
 
 
 def prediction_std(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...exceptions import warn
+from ...lpv.bands import Levels
 from ...lpv.model import LPVStateSpace
 from ...lpv.refinement import Own, Prior, Record, refine, squares, weights_of
 from ...subspace.evidence.residuals import explained_by_inputs
@@ -129,8 +130,8 @@ def _causes(record: Record, center: Array, span: Array) -> Array:
 def tell_of_noisy_scheduling(
     model: LPVStateSpace,
     records: Sequence[Record],
-    errors: Sequence[Array],
-    held: Sequence[Array],
+    errors: Levels,
+    held: Levels,
     names: Sequence[Hashable],
 ) -> None:
     """Tell where scheduling variables do harm, as measured in local `records`.
@@ -138,10 +139,9 @@ def tell_of_noisy_scheduling(
     Where errors are smaller with these `held` at their means. By points of work the
     noise of a sensor moves the outputs at once.
     """
-    own, other = (np.sum(np.vstack(e) ** 2, axis=0) for e in (errors, held))
-    share = np.sqrt(other / np.where(own > 0.0, own, np.inf))
-    moved = sum(np.sum((r.y - r.y.mean(axis=0)) ** 2, axis=0) for r in records)
-    worse = (share < _HELD) & (own > _SEEN**2 * moved)
+    own = errors.both
+    share = held.both / np.where(own > 0.0, own, np.inf)
+    worse = (share < _HELD) & (own * weights_of(records) > _SEEN)
     if worse.any():
         k = int(np.argmin(np.where(worse, share, np.inf)))
         shown = list(model.scheduling_names or range(1, model.n_scheduling + 1))

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...data.experiments import Experiment
-from ...metrics.scores import best_fit
+from ...metrics.scores import fit_of_norms
 from ...models.statespace import StateSpace, unknown_responses
 from ...systems.simulation import (
     delayed,
     estimate_initial_state,
-    spread_of,
     state_trajectory,
     trend_signals,
 )
 
 Array = NDArray[np.float64]
+
+_AT_ONCE = 131_072  # samples that are simulated together
 
 _ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 
@@ -27,24 +28,47 @@ _ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 class Measured(NamedTuple):
     """Experiments as models are compared with them."""
 
-    size: Array  # how far outputs move
-    # Of each length: inputs (length, n_inputs, n_runs), one run if all are alike, and
-    # outputs channel by channel in memory, as experiments are: (n_outputs, n_runs,
-    # length)
-    parts: list[tuple[Array, Array]]
+    batches: list[list[Experiment]]  # of one length each, that are simulated together
+    size: Array  # how far outputs move, as `spread_of`
+    spread: Array  # root of the squares about their means, in these sizes
 
     @classmethod
     def of(cls, group: Sequence[Experiment]) -> Measured:
-        size = spread_of(np.vstack([e.measured for e in group]))
-        parts = []
+        batches = []
         for length in sorted({len(e.rows) for e in group}):
             part = [e for e in group if len(e.rows) == length]
+            n = max(1, _AT_ONCE // length)
+            batches += [part[k : k + n] for k in range(0, len(part), n)]
+        return cls(batches, *_sizes([e.measured for e in group]))
+
+    def stacked(self) -> Iterator[tuple[Array, Array]]:
+        """Of each batch inputs (length, n_inputs, n_runs), one run if all are alike.
+
+        And outputs channel by channel in memory, as experiments are: (n_outputs,
+        n_runs, length).
+        """
+        for part in self.batches:
             inputs = [e.inputs for e in part]
             if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
                 inputs = inputs[:1]
             y = np.stack([e.measured.T for e in part], axis=1)
-            parts.append((np.stack(inputs, axis=-1), y))
-        return cls(size, parts)
+            yield np.stack(inputs, axis=-1), y
+
+
+def _sizes(outputs: Sequence[Array]) -> tuple[Array, Array]:
+    """`size` and `spread` of `Measured`, without a copy of all outputs."""
+    n = np.sum([np.count_nonzero(~np.isnan(y), axis=0) for y in outputs], axis=0)
+    known = np.maximum(n, 1)
+    mean = np.sum([np.nansum(y, axis=0) / known for y in outputs], axis=0)
+    low, high = (
+        np.array([f.reduce(y, axis=0) for y in outputs]) for f in (np.fmin, np.fmax)
+    )
+    moves = np.fmin.reduce(low) < np.fmax.reduce(high)
+    unit = np.where(moves, np.fmax.reduce(np.fmax(high - mean, mean - low)), 1.0)
+    squares = [np.nansum(((y - mean) / unit) ** 2, axis=0) for y in outputs]
+    root = np.sqrt(np.sum(squares, axis=0))
+    size = np.where(moves, unit * root / np.sqrt(known), 1.0)
+    return size, np.where(moves, np.sqrt(known), 0.0)
 
 
 def fit_of(
@@ -63,20 +87,19 @@ def fit_of(
     sampled = model.to_discrete(sampling_time, hold)
     if n_trend and _integrates(model):  # what offsets of the inputs add up to
         n_trend = 2
-    true, simulated = [], []
-    for inputs, y in measured.parts:
+    squares = np.zeros(model.n_outputs)
+    for inputs, y in measured.stacked():
         length, u = len(inputs), delayed(inputs, sampled.input_delay)
         x = state_trajectory(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
         free = unknown_responses(sampled, length, trend_signals(length, n_trend))
-        forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
-        errors = (y - forced).transpose(2, 0, 1)
-        own = estimate_initial_state(free, errors, measured.size)
-        found = forced + own.T @ free.transpose(1, 2, 0)
-        true.append(y.reshape(model.n_outputs, -1))
-        simulated.append(found.reshape(model.n_outputs, -1))
-    return float(best_fit(np.hstack(true).T, np.hstack(simulated).T, "uniform_average"))
+        errors = y - (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
+        own = estimate_initial_state(free, errors.transpose(2, 0, 1), measured.size)
+        errors -= own.T @ free.transpose(1, 2, 0)
+        errors /= measured.size[:, None, None]
+        squares += np.nansum(errors**2, axis=(1, 2))
+    return fit_of_norms(np.sqrt(squares), measured.spread)
 
 
 def _integrates(model: StateSpace) -> bool:

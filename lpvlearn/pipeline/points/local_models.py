@@ -27,6 +27,7 @@ from ...models.statespace import (
 )
 from ...restructuring.minimise_covariance import Estimate
 from ...subspace.diagnosis.fit_warnings import OF_LASTING
+from ...subspace.estimator import SubspaceLTI
 from ...subspace.evidence.constants import CERTAIN
 from ...subspace.fits.integrating import integrating_flags
 from ...subspace.telling import unheard
@@ -52,6 +53,9 @@ _ABOUT_ZERO = 0.25  # of the others: it may be one, known by samples that are no
 _NOTHING = 1e-6  # share by which what does not decay, to rounding, may do so or grow
 HARDLY = 0.05  # share by which an integrator may decay, or grow, in a record
 _GROWN = 3.0  # time constants per record, up to which one that grows may be one
+
+# What fits experiments as methods do that take a table.
+_OF_READ = {"fit": "fit_experiments", "fit_each": "fit_each_experiment"}
 
 _TWICE = (  # advice for models of rates
     "Where rates integrate as well, as the velocity of what nothing holds, have a "
@@ -628,6 +632,14 @@ def _fit_table(
     local: Any, experiments: Sequence[Experiment], sampling_time: float, method: str
 ) -> Any:
     """What a clone's method of fitting returns for the experiments as one table."""
+    estimator = clone(local)
+    known = estimator.get_params(deep=False)
+    # an estimator that fits in a way of its own is given a table
+    own_way = getattr(type(local), method) is not getattr(SubspaceLTI, method)
+    if not (own_way or integrates(local)):
+        estimator.set_params(sampling_time=sampling_time)
+        read = [_with_step(e, sampling_time) for e in experiments]
+        return getattr(estimator, _OF_READ[method])(read)
     table, y = as_table(experiments)
     *inputs, label = table.columns
     own: dict[str, Any] = {
@@ -636,10 +648,12 @@ def _fit_table(
         "experiment": label,
         "sampling_time": sampling_time,
     }
-    estimator = clone(local)
-    known = estimator.get_params(deep=False)
     estimator.set_params(**{name: own[name] for name in own if name in known})
     return getattr(estimator, method)(table, y)
+
+
+def _with_step(experiment: Experiment, sampling_time: float) -> Experiment:
+    return replace(experiment, sampling_time=sampling_time, breaks=(), jitter=0.0)
 
 
 def _of_lowest_order(models: Sequence[StateSpace]) -> list[StateSpace]:

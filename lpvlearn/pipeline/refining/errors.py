@@ -6,7 +6,7 @@ those that fit best: the responses R are projected out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...data.experiments import Experiment, naming
 from ...exceptions import warn
-from ...lpv.bands import levels_of
+from ...lpv.bands import Levels, levels_of
 from ...lpv.model import LPVStateSpace
 from ...lpv.refinement import (
     Own,
@@ -71,22 +71,21 @@ def own_of_local(found: StructuredModels) -> Own:
 def errors_along(
     model: LPVStateSpace,
     experiments: Sequence[Experiment],
-    records: Sequence[Record],
+    records: Iterable[Record],
     own: Own,
-) -> list[Array]:
+) -> Iterator[Array]:
     """Simulation errors of runs, each with the unknowns of its own that fit best.
 
     Realizations that follow each other are simulated once.
     """
-    errors: list[Array] = []
     last: Record | None = None
     for e, record in zip(experiments, records, strict=True):
         with naming(e):
             if last is None or not _alike(record, last):
                 responses = responses_along(model, record, own)
-            errors.append(simulated(model, record, own, responses=responses)[0])
+            error = simulated(model, record, own, responses=responses)[0]
         last = record
-    return errors
+        yield error
 
 
 def _alike(one: Record, other: Record) -> bool:
@@ -108,14 +107,15 @@ def local_output_errors(
     names = model.output_names or range(1, model.n_outputs + 1)
 
     try:
-        errors = errors_along(quiet, runs, records, own)
+        levels = levels_of(errors_along(quiet, runs, records, own))
         if any(np.ptp(r.kappa, axis=0).any() for r in records):
-            held = [_held(record) for record in records]
-            still = errors_along(quiet, runs, held, own)
-            tell_of_noisy_scheduling(model, records, errors, still, names)
+            held = map(_held, records)
+            still = levels_of(errors_along(quiet, runs, held, own))
+            tell_of_noisy_scheduling(model, records, levels, still, names)
     except ValueError:  # it diverges, or has no matrices there
-        errors = [np.full((1, model.n_outputs), np.nan)]
-    return output_errors(names, errors)
+        unknown = np.full(model.n_outputs, np.nan)
+        levels = Levels(unknown, unknown)
+    return output_errors(names, levels)
 
 
 def _held(record: Record) -> Record:
