@@ -83,7 +83,8 @@ from .one_basis.structured_models import (
     without_structure,
 )
 from .one_basis.together import through_black_boxes
-from .points.common_choices import common_delay, identify_points, of_structure
+from .points.common_choices import identify_points, of_structure
+from .points.common_delay import common_delay
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.integrators import integrated
 from .points.late_inputs import with_delays

@@ -18,7 +18,7 @@ from sklearn.base import clone
 
 from ...data.experiments import Experiment
 from ...data.operating_points import OperatingPoints
-from ...exceptions import collected, warn
+from ...exceptions import collected
 from ...restructuring.known_poles import (
     hidden_integrators,
     integrators,
@@ -26,9 +26,8 @@ from ...restructuring.known_poles import (
 )
 from ...structures.structure import GrayBoxStructure
 from ...subspace.estimator import SubspaceLTI
-from ...subspace.fits.delay import with_late_inputs
-from ...subspace.simulation_error.criterion import PRICE
-from ..running.runner import Done, PointRunner, label_of, tell_skipped
+from ..running.runner import Done, PointRunner, tell_skipped
+from .common_delay import some_of, with_one_delay
 from .local_models import (
     LocalModel,
     identify_point,
@@ -38,11 +37,6 @@ from .local_models import (
 )
 
 Array = NDArray[np.float64]
-
-# Points that together tell one delay of all, and by how much, in twice the logarithm of
-# the likelihood, it must be likelier than another; or a delay of a point of its own.
-_PROBED, _CLEARER = 5, 6.0
-_CHANCE = 2  # samples by which delays that points find for themselves may differ
 
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first: a mode may vanish, or come.
@@ -107,12 +101,12 @@ def identify_points(
 
     known: list[Done | None] = [None] * len(groups)
     if _looks_for_delays(local, groups, options["combine"]):
-        local, known = _with_one_delay(local, tried, groups, options["sampling_time"])
+        local, known = with_one_delay(local, tried, groups, options["sampling_time"])
     if not chooses or structure is not None:
         found = identify(local, known)
     else:
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
-        some = _spread(len(groups), _SCOUTS)
+        some = some_of(len(groups), _SCOUTS)
         scouts = tried(local, some, known) if search else []
         if is_left(local, "offset"):
             # whatever the others are, but where drifts are what all of them lack
@@ -151,11 +145,6 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 
-def _spread(n_points: int, most: int) -> list[int]:
-    """Some of the points, from the first to the last."""
-    return np.unique(np.linspace(0, n_points - 1, most).round().astype(int)).tolist()
-
-
 def _looks_for_delays(
     local: Any, groups: Sequence[Sequence[Experiment]], combine: str
 ) -> bool:
@@ -166,132 +155,6 @@ def _looks_for_delays(
     asked = type(local) is SubspaceLTI and isinstance(local.input_delay, str)
     averages = combine == "average" and any(len(labels_of(g)) > 1 for g in groups)
     return asked and len(groups) > 1 and not averages and not integrates(local)
-
-
-def _with_one_delay(
-    local: Any,
-    tried: Callable[..., list[Done | None]],
-    groups: Sequence[Sequence[Experiment]],
-    sampling_time: float,
-) -> tuple[Any, list[Done | None]]:
-    """The estimator with the delay of all points, where each was to find its own.
-
-    And its models of the points that told. A short record takes a sample more or less
-    for states, or for noise. Criteria of independent records add up: beginning at the
-    median of some points, longer delays of an input are taken where these together are
-    likelier so by more than a state, which may stand for a sample, and shorter ones
-    where they are as likely. Not where delays of their own are likelier beyond doubt,
-    as with transport at another speed.
-    """
-    found = tried(local, _spread(len(groups), _PROBED))
-    known: dict[tuple[int, ...], list[Done | None]] = {}
-
-    def costs_of(found: Sequence[Done | None]) -> dict[int, float]:
-        return {
-            k: cost_with_delay(local, done.result, groups[k], sampling_time)
-            for k, done in enumerate(found)
-            if done is not None
-        }
-
-    def delay_of(done: Done) -> NDArray[np.intp]:
-        return delay_in_samples(done.result, sampling_time)
-
-    own = costs_of(found)
-    least_of_own = sum(own.values())
-
-    def having(
-        delay: NDArray[np.intp], points: Sequence[int]
-    ) -> tuple[Any, list[Done | None]]:
-        """The estimator and its models, which of a delay found is that of one given."""
-        estimator = clone(local).set_params(input_delay=delay.tolist())
-        have = [
-            done if done is not None and (delay_of(done) == delay).all() else None
-            for done in found
-        ]
-        have = known.get(tuple(delay.tolist()), have)
-        new = tried(estimator, points, have) if points else have
-        models = [a if b is None else b for a, b in zip(have, new, strict=True)]
-        known[tuple(delay.tolist())] = models
-        return estimator, models
-
-    def cost(delay: NDArray[np.intp], former: NDArray[np.intp] | None = None) -> float:
-        """Or infinity, where the first point is far likelier with a former delay.
-
-        One that all points have is far worse for none of them.
-        """
-        first, limit = min(own), np.inf
-        if former is not None:
-            limit = costs_of(having(former, [])[1])[first] + _CLEARER * len(own)
-        for points in ([first], list(own)):
-            costs = costs_of(having(delay, points)[1])
-            if any(k not in costs for k in points) or costs[first] > limit:
-                return np.inf
-        return sum(costs.values())
-
-    if len(own) < 2 or not np.isfinite(least_of_own):
-        return local, found
-    delays = np.array([delay_of(done) for done in found if done is not None])
-    delay = np.sort(delays, axis=0)[(len(own) - 1) // 2]
-    agree = bool((delays == delay).all())
-    if agree and delay.any():
-        return having(delay, [])
-    inputs, outputs = groups[0][0].inputs.shape[1], groups[0][0].measured.shape[1]
-    state = len(own) * PRICE * (inputs + outputs)
-    far_apart = bool((np.ptp(delays, axis=0) > _CHANCE).any())
-    least = cost(delay, delays[0] if far_apart else None)
-    if np.isinf(least):
-        return local, found
-    for sample in np.eye(len(delay), dtype=np.intp):
-        for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
-            delay, least = _along(step, worth, (delay, least), cost)
-    alike = least < least_of_own + _CLEARER * (len(own) - 1)
-    return having(delay, []) if alike else (local, found)
-
-
-def cost_with_delay(
-    local: SubspaceLTI,
-    model: LocalModel,
-    experiments: Sequence[Experiment],
-    sampling_time: float,
-) -> float:
-    """The criterion of as many samples, whatever is unknown of the first ones."""
-    rest, gaps = local.initial_state == "rest", local.missing != "raise"
-    delay = delay_in_samples(model, sampling_time)
-    n_samples, n_known = (
-        sum(
-            len(e.rows)
-            for e in with_late_inputs(experiments, some, rest=rest, gaps=gaps)
-        )
-        for some in (np.zeros_like(delay), delay)
-    )
-    return model.criterion * n_samples / n_known
-
-
-def delay_in_samples(model: LocalModel, sampling_time: float) -> NDArray[np.intp]:
-    """The delays of the inputs of a local model."""
-    return np.round(model.lti.input_delay / sampling_time).astype(np.intp)
-
-
-def _along(
-    step: NDArray[np.intp],
-    worth: float,
-    start: tuple[NDArray[np.intp], float],
-    cost: Callable[[NDArray[np.intp], NDArray[np.intp]], float],
-) -> tuple[NDArray[np.intp], float]:
-    """The delay of least cost some steps from a start, where that is `worth` it.
-
-    Up to where the cost rises beyond doubt.
-    """
-    delay, least = start
-    best, lowest, other = start, least - worth, delay + step
-    while (other >= 0).all():
-        reached = cost(other, other - step)
-        if not reached < least + _CLEARER:
-            break
-        if reached < lowest:
-            best, lowest = (other, reached), reached
-        least, other = min(least, reached), other + step
-    return best
 
 
 def _of_own_orders(
@@ -420,30 +283,3 @@ def _bare(experiment: Experiment) -> Experiment:
         scheduling=None,
         operating_point=None,
     )
-
-
-def common_delay(
-    local: Sequence[LocalModel], kappa: Array, sampling_time: float
-) -> Array:
-    """Delay of the inputs, seconds, of all operating points: their lower median.
-
-    Warns where they do not agree.
-    """
-    delays = np.array([model.lti.input_delay for model in local])
-    median = np.sort(delays, axis=0)[(len(delays) - 1) // 2]
-    samples = np.round(delays / sampling_time).astype(int)
-    if (samples != samples[0]).any():
-        each = "; ".join(
-            f"{label_of(row)}: {', '.join(map(str, own))}"
-            for row, own in zip(kappa, samples.tolist(), strict=True)
-        )
-        taken = ", ".join(map(str, np.round(median / sampling_time).astype(int)))
-        warn(
-            "the input delay differs between operating points (scheduling: samples of "
-            f"each input; {each}). The LPV model takes the median, {taken}; the local "
-            "models keep their own. Where the system has one delay, give it: "
-            "local=SubspaceLTI(input_delay=...). Where it follows the scheduling "
-            "variable, as transport at another speed does, shift the column of the "
-            "input by what is known of it, for the fit and for predictions."
-        )
-    return median

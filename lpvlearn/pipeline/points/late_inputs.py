@@ -16,7 +16,7 @@ from sklearn.base import clone
 from ...data.operating_points import OperatingPoints
 from ...exceptions import Told, collected, warn
 from ...subspace.estimator import SubspaceLTI
-from .common_choices import cost_with_delay, delay_in_samples
+from .common_delay import cost_with_delay, delay_in_samples
 from .local_models import ALTERNATES, LocalModel, integrates
 
 # What is told of models that a delay is missing in: that, what else a model of a given

@@ -40,7 +40,8 @@ from ..one_basis.structured_models import (
     restructure_points,
     without_structure,
 )
-from ..points.common_choices import common_delay, identify_points, of_structure
+from ..points.common_choices import identify_points, of_structure
+from ..points.common_delay import common_delay
 from ..points.local_models import (
     LocalModel,
     balanced_by_motion,
