@@ -1472,6 +1472,12 @@ def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
 
 def _names_read(experiments: Sequence[Experiment]) -> tuple[Any, Any]:
     """Names of inputs and outputs, which experiments that were made may not have."""
+    listed = isinstance(experiments, list | tuple) and len(experiments)
+    if not listed or not all(isinstance(e, Experiment) for e in experiments):
+        raise ValueError(
+            "`experiments` must be what `read_experiments` returns, one at least. Got "
+            f"{shown(experiments)}. Use `fit`, which takes tables."
+        )
     first = experiments[0]
     return list(first.input_names) or None, list(first.output_names) or None
 

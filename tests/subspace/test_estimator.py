@@ -453,6 +453,9 @@ def test_each_experiment_that_was_read_has_the_model_of_its_row(rng):
         integrating.fit_experiments(read)
     with pytest.raises(ValueError, match="`integrating` must be None in fit_each"):
         integrating.fit_each_experiment(read)
+    for one in ([], X, [X]):
+        with pytest.raises(ValueError, match="Use `fit`, which takes tables"):
+            model.fit_experiments(one)
 
 
 def test_each_needs_outputs_that_do_not_integrate(rng):
