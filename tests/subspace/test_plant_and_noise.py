@@ -7,6 +7,10 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.subspace.closed_loop.plant_and_noise import ByInputs
+from lpvlearn.subspace.closed_loop.predictor import Innovation, prediction_errors
+from lpvlearn.subspace.samples.records import Record
+from lpvlearn.subspace.simulation_error.simulation_fit import Freedom
 
 from .conftest import LOOP_PLANT, closed_loop, miss, pbsid
 
@@ -95,3 +99,65 @@ def test_standard_deviations_cover(pole):
     # Errors of one record depend on each other: as many as its parameters count.
     low, high = binom.interval(0.99, 20 * 4, 0.95)
     assert low <= np.mean(inside) * 80 <= high + 1
+
+
+def two_lags_in_a_loop(seed, level=8.0, n=700, step=5.0):
+    """Two tanks in a PI loop, of lags that are nearly equal, their level rounded."""
+    rng = np.random.default_rng(seed)
+    rate = 9.0 / np.sqrt(level) / np.array([300.0, 240.0])
+    tanks = StateSpace(
+        [[-rate[0], 0.0], [rate[1], -rate[1]]], [[2.0 / 300.0], [0.0]], [[0.0, 1.0]]
+    )
+    sampled = tanks.to_discrete(step)
+    A, B = sampled.A, sampled.B
+    reference = rng.choice([-1.0, 1.0], n // 60 + 1).repeat(60)
+    shaken = 2.5 * rng.choice([-1.0, 1.0], n // 20 + 1).repeat(20)
+    x, total, u, y = np.zeros(2), 0.0, np.empty((n, 1)), np.empty(n)
+    for k in range(n):
+        y[k] = np.round(10.0 * (x[1] + 0.02 * rng.standard_normal())) / 10.0
+        total += step * (reference[k] - y[k])
+        u[k] = shaken[k] + 3.0 * (reference[k] - y[k]) + 0.008 * total
+        x = A @ x + B[:, 0] * u[k]
+    return u, y, tanks.dc_gain()[0, 0]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_lags_that_nearly_coincide_stay_together():
+    """The large rows of B of either are uncertain; without one of them nothing fits."""
+    for seed in range(6):
+        u, y, gain = two_lags_in_a_loop(seed)
+        model = SubspaceLTI(2, method="pbsid", sampling_time=5.0).fit(u, y)
+        assert_allclose(model.lti_.dc_gain(), gain, rtol=0.02)
+
+
+def test_errors_of_prediction_are_linear_in_b_and_d(rng):
+    A = np.diag([0.9, 0.5, -0.3])
+    B, C = rng.standard_normal((3, 2)), rng.standard_normal((2, 3))
+    D, K = rng.standard_normal((2, 2)), 0.1 * rng.standard_normal((3, 2))
+    u, e = rng.standard_normal((300, 2)), 0.1 * rng.standard_normal((300, 2))
+    B[1] = 0.0
+    x, y = np.zeros(3), np.empty((300, 2))
+    for k in range(300):
+        y[k] = C @ x + D @ u[k] + e[k]
+        x = A @ x + B @ u[k] + K @ e[k]
+    free = Freedom(np.ones((2, 2), bool), True)
+    records = [Record.of(u, y)]
+    model = Innovation(A, B, C, D, K, 0.01 * np.eye(2))
+    by_inputs = ByInputs.of(model, records, free)
+    reached = np.array([True, False, True])
+    loss, found = by_inputs.reaching(reached)
+    assert not found.B[1].any()
+    assert_allclose(found.B, B, atol=0.05)
+    assert_allclose(found.D, D, atol=0.05)
+
+    def loss_of(model):
+        errors = np.vstack(prediction_errors(model, records, free)[1])
+        return np.sum(errors**2) / 0.01
+
+    assert_allclose(loss, loss_of(found), rtol=1e-6)
+    for moved in ("B", "D"):
+        change = 1e-3 * rng.standard_normal(getattr(found, moved).shape)
+        change[1] = 0.0
+        other = found._replace(**{moved: getattr(found, moved) + change})
+        assert loss_of(other) > loss
+    assert by_inputs.reaching(np.ones(3, bool))[0] < loss

@@ -190,9 +190,8 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     later = later._replace(pairs=with_later_inputs(pairs, lead)).aside()
     error = samples.errors_held_out(fitted)
     led = _OF_NOISE if fitted.grows() else _LED
-    # One order tells whether it is worth while to look for the best, of no more states.
+    # One order tells whether it is worth while to look for the best.
     first = choices.order or max(1, fitted.selection.order)
-    later = later.having(orders=choices.orders or tuple(range(1, first + 1)))
     for order, share in {first: _NO_MORE, choices.order: led}.items():
         later = later.having(order=order)
         try:

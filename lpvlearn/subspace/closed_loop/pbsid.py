@@ -212,14 +212,14 @@ def _told_apart(
     """Plant and noise of the first of these models that tells them apart."""
     n = subspace.n_columns
     for fitted, joint in found:
-        split = split_modes(joint, fitted, order, n)
+        split = split_modes(joint, fitted, order, records, free, n)
         if split is None:
             continue
         T, kept = split
         apart = joint.transformed(T)
         if fitted is None or kept.all():
             return _Together(fitted, apart, T, kept)
-        models = without_reached_noise(apart, fitted, T, kept, free.direct)
+        models = without_reached_noise(apart, fitted, T, kept, records, free)
         apart, fewer = _likeliest(models, records, free), int((~kept).sum())
         if order is not None or _as_likely(apart, joint, fewer, records, n):
             return _Together(fitted, apart, T, kept)

@@ -25,12 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...models.innovation import NoiseModel
+from ...systems.least_squares import scaled_lstsq
 from ...systems.modes import spectral_radius
 from ..evidence.statistics import Evidence
 from ..orders.identification import REFITS
 from ..samples.records import Record, ScaledRecords, share_known
 from ..simulation_error.simulation_fit import Freedom, Realization, with_initial_states
-from .predictor import Innovation, Predictor, refine_predictor
+from .predictor import (
+    Innovation,
+    Predictor,
+    innovation_root,
+    prediction_errors,
+    refine_predictor,
+)
 
 Array = NDArray[np.float64]
 
@@ -168,13 +175,66 @@ class _Split(NamedTuple):
     kept: NDArray[np.bool_]
 
 
+class ByInputs(NamedTuple):
+    r"""Errors of prediction as B and D make them, given A, C and K.
+
+    Whitened, they are ``e_0 + X [vec B; D]``; of ``[X e_0]`` a triangular factor tells
+    all. Unlike Wald's statistic that is exact: of two poles that nearly coincide the
+    large rows of B, opposite to each other, are uncertain, though neither may go.
+    """
+
+    model: Innovation
+    factor: Array
+    direct: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, model: Innovation, records: Sequence[Record], free: Freedom
+    ) -> ByInputs:
+        """Those of a model, whatever its own B and D."""
+        direct = free.direct
+        B, D = np.zeros_like(model.B), np.zeros_like(model.D)
+        energy = np.mean(np.hstack([record.y for record in records]) ** 2, axis=1)
+        weight = np.linalg.inv(innovation_root(model.covariance, energy)).T
+
+        def errors() -> Array:
+            found = prediction_errors(model._replace(B=B, D=D), records, free)[1]
+            return (np.vstack(found) @ weight).ravel()
+
+        X, none = [], errors()
+        for entries, some in ((B, np.ones(B.shape, bool)), (D, direct)):
+            for place in zip(*np.nonzero(some), strict=True):
+                entries[place] = 1.0
+                X.append(errors() - none)
+                entries[place] = 0.0
+        factor = np.linalg.qr(np.column_stack([*X, none]), mode="r")
+        return cls(model, np.asarray(factor), direct)
+
+    def reaching(self, kept: NDArray[np.bool_]) -> tuple[float, Innovation]:
+        """Squared errors and model if the inputs reach these states alone."""
+        n_direct = int(self.direct.sum())
+        B, D = np.zeros_like(self.model.B), self.model.D.copy()
+        free = np.append(np.repeat(kept, B.shape[1]), np.ones(n_direct, bool))
+        X, e = self.factor[:, :-1][:, free], self.factor[:, -1]
+        found = scaled_lstsq(X, -e)[0]
+        by_B, D[self.direct] = np.split(found, [len(found) - n_direct])
+        B[kept] = by_B.reshape(-1, B.shape[1])
+        return float(np.sum((e + X @ found) ** 2)), self.model._replace(B=B, D=D)
+
+
 def split_modes(
-    joint: Innovation, fitted: Predictor | None, order: int | None, n: int
+    joint: Innovation,
+    fitted: Predictor | None,
+    order: int | None,
+    records: Sequence[Record],
+    free: Freedom,
+    n: int,
 ) -> _Split | None:
     """Tell the plant's modes from those of the noise, which no input reaches.
 
     A mode is the plant's where its rows of B speak for themselves, by Schwarz's
-    criterion. None where no such modes add up to a given order.
+    criterion; of a given order those are that the errors can least do without, one
+    after another. None where no such modes add up to it, or others speak as well.
     """
     whole = _Split(np.eye(len(joint.A)), np.ones(len(joint.A), dtype=bool))
     if len(joint.A) in (0, order) or (order is None and fitted is None):
@@ -182,20 +242,23 @@ def split_modes(
     T, modes = _modes(joint.A)
     if not np.linalg.cond(T) < _MAX_CONDITION:
         return whole if order is None else None
-    modal = joint.transformed(T)
-    reached = _reached(modal, T, modes, fitted)
-    kept = np.zeros(len(T), dtype=bool)
-    limit = joint.B.shape[1] * np.log(n)
-    for k in np.argsort(reached)[::-1]:
-        if order is None:
-            fits = reached[k] > limit
-        else:
-            fits = kept.sum() + modes[k].sum() <= order
-        if fits:
+    modal, limit = joint.transformed(T), joint.B.shape[1] * np.log(n)
+    reached = np.zeros(len(modes))
+    if fitted is not None:
+        reached = _reached(modal, T, modes, fitted)
+    if order is None:
+        kept = np.zeros(len(T), dtype=bool)
+        for k in np.flatnonzero(reached > limit):
             kept |= modes[k]
-        elif reached[k] > limit:
-            return None  # the inputs reach more modes than wanted
-    return _Split(T, kept) if order in (None, kept.sum()) else None
+        return _Split(T, kept)
+    kept, by_inputs = whole.kept.copy(), ByInputs.of(modal, records, free)
+    while kept.sum() > order:
+        fewer = [kept & ~mode for mode in modes if kept[mode].all()]
+        kept = min(fewer, key=lambda some: by_inputs.reaching(some)[0])
+    speak = [
+        r > limit and not kept[m].all() for r, m in zip(reached, modes, strict=True)
+    ]
+    return None if any(speak) or kept.sum() < order else _Split(T, kept)
 
 
 def without_reached_noise(
@@ -203,27 +266,26 @@ def without_reached_noise(
     fitted: Predictor,
     transform: Array,
     kept: NDArray[np.bool_],
-    direct: NDArray[np.bool_],
+    records: Sequence[Record],
+    free: Freedom,
 ) -> list[Innovation]:
-    """Models given that no input reaches the noise: to first order, and as it is.
+    """Models given that no input reaches the noise, in B and D of least squares.
 
-    The former where it is stable. Where outputs are of unequal quality, the first order
-    may be worse than none.
+    With A and C as they are, and as that tells of them to first order: where outputs
+    are of unequal quality, or poles nearly coincide, that may be worse than nothing.
     """
+    direct = free.direct
     shift = _knowledge(fitted, joint, transform, kept, direct).shift
     n, (ny, m) = int(kept.sum()), direct.shape
-    A, B, C, D = (M.copy() for M in joint[:4])
-    B[~kept] = 0.0
-    as_it_is = joint._replace(B=B.copy())
     ends = np.cumsum([n * m, direct.sum(), n * n])
-    by_B, by_D, by_A, by_C = np.split(shift, ends)
-    B[kept] += by_B.reshape(n, m)
-    D[direct] += by_D
+    *_, by_A, by_C = np.split(shift, ends)
+    A, C = joint.A.copy(), joint.C.copy()
     A[np.ix_(kept, kept)] += by_A.reshape(n, n)
     C[:, kept] += by_C.reshape(ny, n)
-    moved = joint._replace(A=A, B=B, C=C, D=D)
-    stable = spectral_radius(A - joint.K @ C) < 1.0
-    return [moved, as_it_is] if stable else [as_it_is]
+    models = [joint]
+    if spectral_radius(A - joint.K @ C) < 1.0:
+        models.append(joint._replace(A=A, C=C))
+    return [ByInputs.of(model, records, free).reaching(kept)[1] for model in models]
 
 
 def _modes(A: Array) -> tuple[Array, list[NDArray[np.bool_]]]:
@@ -244,17 +306,12 @@ def _reached(
     modal: Innovation,
     transform: Array,
     modes: Sequence[NDArray[np.bool_]],
-    fitted: Predictor | None,
-) -> list[float]:
+    fitted: Predictor,
+) -> Array:
     """How clearly the inputs reach every mode, for each of its states.
 
-    Wald's statistic of its rows of B; without a covariance, what they move the outputs
-    by.
+    Wald's statistic of its rows of B.
     """
-    if fitted is None:
-        return [
-            float(np.linalg.norm(modal.C[:, mode] @ modal.B[mode])) for mode in modes
-        ]
     covariance = fitted.parameter_covariance(modal.covariance)
     changes = fitted.jacobian(len(covariance)).transformed(transform)
     values = []
@@ -262,4 +319,5 @@ def _reached(
         J = changes.of_part(modal, mode).B.reshape(len(covariance), -1)
         b, spread = modal.B[mode].ravel(), J.T @ covariance @ J
         values.append(float(b @ np.linalg.pinv(spread, hermitian=True) @ b))
-    return [value / mode.sum() for value, mode in zip(values, modes, strict=True)]
+    sizes = [mode.sum() for mode in modes]
+    return np.array(values) / sizes
