@@ -903,18 +903,23 @@ list, default=None
                 estimator, local, kept, *known, first.input_names
             )
         if black_boxes and not wrong:
-            grows = refused is not None
             estimator, local = integrated(
-                estimator, local, kept, *known, self.output_names_, growing=grows
+                estimator,
+                local,
+                kept,
+                *known,
+                self.output_names_,
+                growing=refused is not None,
             )
+        if refused is not None and not local[0].integrating:
+            raise refused
+        if black_boxes and not wrong:
             said = len(told)
             order = _foreseen_order(estimator, local, kept, longest, again)
             if order is not None:
                 del told[:said]  # of the models of more states
                 estimator = clone(estimator).set_params(order=order)
                 local, kept = identify(estimator, points, runner)
-        if refused is not None and not local[0].integrating:
-            raise refused
         take_back(LINE)  # the LPV model rests where it begins
         if points is not whole:
             tell_of_held(first.scheduling_names)

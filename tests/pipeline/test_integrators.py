@@ -117,3 +117,34 @@ def test_a_structure_may_integrate_without_a_word():
     off = (model.parameters_ - np.array(true)) / model.parameters_std_
     assert off.abs().to_numpy().max() < 3.5
     assert (model.parameters_std_ / np.array(true) < 3e-3).all(axis=None)
+
+
+def battery(seed, n=900):
+    """Cells at five states of charge, which the current hardly changes."""
+    rng, runs = np.random.default_rng(seed), []
+    for charge in (0.15, 0.3, 0.5, 0.7, 0.9):
+        current = 12.0 * np.repeat(rng.choice([-1.0, 1.0], n // 15), 15)
+        fast, slow, serial = (
+            a + b * np.exp(-c * charge)
+            for a, b, c in ((4.0, 6.0, 5.0), (6.0, 10.0, 4.0), (12.0, 8.0, 6.0))
+        )
+        v1, v2, z, volts = 0.0, 0.0, charge, np.empty(n)
+        for k, i in enumerate(1e-3 * current):
+            at_rest = 3.2 + 0.9 * z + 0.15 * np.tanh(4.0 * z - 2.0)
+            at_rest += 0.08 * np.log(z / (1.02 - z))
+            volts[k] = at_rest - v1 - v2 - serial * i
+            v1 += (1.0 - np.exp(-1.0 / 8.0)) * (fast * i - v1)
+            v2 += (1.0 - np.exp(-1.0 / 90.0)) * (slow * i - v2)
+            z -= 1e3 * i / (50.0 * 3600.0)
+        volts += 0.025 * volts.std() * rng.standard_normal(n)
+        runs.append((current, charge, np.round(volts, 3)))
+    return from_trajectories(runs, sampling_time=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_point_that_grows_slowly_is_named_where_others_do_not():
+    """Not by what compares the points, which balances their models."""
+    X, y = battery(9)
+    with pytest.raises(ValueError, match="point 4 .* integrate, name them"):
+        LocalLPVPipeline(**ROLES).fit(X, y)

@@ -24,9 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...models.innovation import NoiseModel
+from ...models.innovation import NoiseModel, prediction_responses
 from ...systems.least_squares import scaled_lstsq
 from ...systems.modes import spectral_radius
+from ...systems.simulation import state_trajectory
 from ..evidence.statistics import Evidence
 from ..orders.identification import REFITS
 from ..samples.records import Record, ScaledRecords, share_known
@@ -192,23 +193,29 @@ class ByInputs(NamedTuple):
         cls, model: Innovation, records: Sequence[Record], free: Freedom
     ) -> ByInputs:
         """Those of a model, whatever its own B and D."""
-        direct = free.direct
-        B, D = np.zeros_like(model.B), np.zeros_like(model.D)
+        A, B, C, D, K, covariance = model
+        n, outputs = len(A), np.eye(len(C))
         energy = np.mean(np.hstack([record.y for record in records]) ** 2, axis=1)
-        weight = np.linalg.inv(innovation_root(model.covariance, energy)).T
-
-        def errors() -> Array:
-            found = prediction_errors(model._replace(B=B, D=D), records, free)[1]
-            return (np.vstack(found) @ weight).ravel()
-
-        X, none = [], errors()
-        for entries, some in ((B, np.ones(B.shape, bool)), (D, direct)):
-            for place in zip(*np.nonzero(some), strict=True):
-                entries[place] = 1.0
-                X.append(errors() - none)
-                entries[place] = 0.0
-        factor = np.linalg.qr(np.column_stack([*X, none]), mode="r")
-        return cls(model, np.asarray(factor), direct)
+        weight = np.linalg.inv(innovation_root(covariance, energy))
+        none = model._replace(B=np.zeros_like(B), D=np.zeros_like(D))
+        factor = np.zeros((0, B.size + int(free.direct.sum()) + 1))
+        errors = prediction_errors(none, records, free)[1]
+        for record, e in zip(records, errors, strict=True):
+            u = record.u.T
+            # of the transposed system the states are the answers to rows of B
+            driven = np.einsum("ai,tj->tiaj", C, u).reshape(len(u), n, -1)
+            x = state_trajectory((A - K @ C).T, driven).reshape(len(u), n, *D.shape)
+            by_B = -x.swapaxes(1, 2)  # (n_samples, n_outputs, n, n_inputs)
+            by_D = -np.einsum("ac,tj->tacj", outputs, u)
+            by_D -= np.einsum("ic,taij->tacj", K, by_B)
+            X = by_B.reshape(*e.shape, -1), by_D[:, :, free.direct], e[:, :, None]
+            X = (weight @ np.concatenate(X, axis=2)).reshape(e.size, -1)
+            own = prediction_responses(A, C, K, len(u), record.trend)
+            own = (weight @ own[:, :, n - free.n_states(n) :]).reshape(e.size, -1)
+            if own.size:
+                X = X - own @ scaled_lstsq(own, X)[0]
+            factor = np.asarray(np.linalg.qr(np.vstack([factor, X]), mode="r"))
+        return cls(model, factor, free.direct)
 
     def reaching(self, kept: NDArray[np.bool_]) -> tuple[float, Innovation]:
         """Squared errors and model if the inputs reach these states alone."""
