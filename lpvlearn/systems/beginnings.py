@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _OFTEN = 10  # moves of inputs that are no step test's
+_MANY = 300  # moves that tell the levels of inputs
 _BRIEF = 0.5  # part of the samples that inputs of pulses are away from their level
 _SELDOM = 4  # moves of inputs that are one, whatever they begin with; pulses of few
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
@@ -42,10 +43,10 @@ def standing(u: Array) -> int:
     return n if n >= _STANDING else 0
 
 
-def _left(u: Array, level: Array) -> NDArray[np.bool_]:
-    """Which samples are far from a level, by the range of all."""
+def _left(u: Array, level: Array, among: Array | None = None) -> NDArray[np.bool_]:
+    """Which samples are far from a level, by the range of all, or of those `among`."""
     with np.errstate(over="ignore"):
-        far = np.abs(u - level) > _STILL * np.ptp(u, axis=0)
+        far = np.abs(u - level) > _STILL * np.ptp(u if among is None else among, axis=0)
     return np.asarray(far.any(axis=1))
 
 
@@ -57,12 +58,23 @@ def _held_again(moves: NDArray[np.intp]) -> int:
 def waiting(u: Array) -> int:
     """As `standing`, but 0 where inputs that move often are held as long later.
 
+    Unless they stand where they never come again, as they do to all levels else.
+
     >>> u = np.repeat([2.0, 3.0] * 9, 8)[:, None]
     >>> standing(u), waiting(u), waiting(u[:40])
     (8, 0, 8)
+    >>> waiting(np.vstack([np.full((8, 1), 2.5), u]))
+    8
     """
-    n = standing(u)
-    return n if n and n > _held_again(moves_of(u)) else 0
+    n, moves = standing(u), moves_of(u)
+    return n if n and (n > _held_again(moves) or _left_for_good(u, moves)) else 0
+
+
+def _left_for_good(u: Array, moves: NDArray[np.intp]) -> bool:
+    """Whether inputs come back to every level that they move to, but not the first."""
+    levels = u[moves[:_MANY] + 1]
+    returns = [np.count_nonzero(~_left(levels, level, u)) > 1 for level in levels]
+    return bool(all(returns) and _left(u[moves[0] + 1 :], u[0], u).all())
 
 
 def moves_of(u: Array) -> NDArray[np.intp]:

@@ -348,3 +348,18 @@ def test_a_slow_mode_in_motion_is_not_taken_for_rest():
     y += 0.03 * y.std() * rng.standard_normal(len(y))
     model = SubspaceLTI(2, offset=None).fit(u[:, None], y)
     assert model.initial_states_.any()
+
+
+@pytest.mark.parametrize("n_first", [0, 8, 20])
+def test_a_level_that_is_left_for_good_is_one_to_stand_at(n_first):
+    """However short the stand: a binary sequence is held as long later, by chance."""
+    rng = np.random.default_rng(n_first)
+    u = 3.0 + 2.0 * np.repeat(rng.choice([-1.0, 1.0], 60), 8)[:, None]
+    u[:n_first] = 2.0  # not the mean, about which models rest
+    true = StateSpace(0.97, 0.03, 1.0, None, 1.0)
+    y = 7.0 + true.simulate(u - 2.0)
+    y += 0.01 * rng.standard_normal(y.shape)
+    model = SubspaceLTI(1).fit(u, y)
+    assert model.steady_start_ == (n_first > 0)
+    if n_first:
+        assert model.score(u, y) > 0.985
