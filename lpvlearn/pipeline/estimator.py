@@ -71,6 +71,7 @@ from ..validation import (
 from .checks.stability import GROWS, growth_rates
 from .one_basis.between_samples import restructured_by_hold
 from .one_basis.black_boxes import foreseen_order
+from .one_basis.in_motion import tell_of_other_states
 from .one_basis.structured_models import (
     StructuredModels,
     local_ones_begin_held,
@@ -99,7 +100,7 @@ from .points.local_models import (
 from .points.mislabelled import tell_of_mislabelled, tell_of_wrong_values
 from .refining.coefficients import known_coefficients, local_covariance, refine_model
 from .refining.errors import local_output_errors, tell_of_missed
-from .refining.starts import best_along
+from .refining.starts import best_along, through
 from .reports.html_report import html_report
 from .reports.tables import Summary, Tables, summarise, tables
 from .running.memory import checked_memory
@@ -609,7 +610,9 @@ list, default=None
                 found = with_foreseen(restructure(restructurer, *known, limit))
                 ways = mirror_images(found) if moving else [found]
             # experiments that move tell what no point does
-            found = best_along(ways, form, moving, self.sampling_time_)
+            found = ways[0]
+            if moving:
+                found = best_along(ways, form, moving, self.sampling_time_)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -636,9 +639,8 @@ list, default=None
                 units=self.units,
                 hold=found.local[0].hold,
             )
-            self.lpv_ = replace(
-                self.lpv_, offsets=self._fit_offsets(models, not moving)
-            )
+            offsets = self._fit_offsets(self.lpv_, models, not moving)
+            self.lpv_ = replace(self.lpv_, offsets=offsets)
             frozen = self.lpv_.silenced().at(kappa[0])
             names = frozen.input_names, frozen.output_names, frozen.units
             self.local_models_ = [m.lti.with_names(*names) for m in found.local]
@@ -648,6 +650,8 @@ list, default=None
             self.parameters_covariance_ = found.covariance
             if not moving:
                 tell_of_mirror_images(found, self.lpv_)
+            if not moving and len(ways) > 1:
+                self._tell_of_states(ways[1], form)
 
         self.refiner_ = None
         if moving:
@@ -951,7 +955,19 @@ list, default=None
                 saturated=saturated,
             )
 
-    def _fit_offsets(self, found: StructuredModels, tell: bool) -> Any:
+    def _tell_of_states(self, aligned: StructuredModels, form: Any) -> None:
+        """Tell where other states make another model in motion."""
+        dt = self.sampling_time_
+        with suppress(ValueError):
+            with collected():  # it is not taken
+                other = through(form, aligned, dt)
+                offsets = self._fit_offsets(other, aligned, False)
+            other = replace(other, offsets=offsets)
+            tell_of_other_states(self.lpv_, other, aligned.points, dt)
+
+    def _fit_offsets(
+        self, model: LPVStateSpace, found: StructuredModels, tell: bool
+    ) -> Any:
         """Interpolation of inputs, outputs and states at rest; None for none."""
         known = offsets_of_points(found) if self.offsets == "auto" else None
         if known is None:
@@ -960,7 +976,7 @@ list, default=None
         beyond = "clip" if held else "ignore"
         spline = partial(SplineLPV, "cubic", extrapolation=beyond)
         values, scales = known
-        frozen = self.lpv_.silenced().at
+        frozen = model.silenced().at
         kappa = found.points.kappa
         return interpolated(spline, kappa, values, frozen, scales, tell=tell)
 

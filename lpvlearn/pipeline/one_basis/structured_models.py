@@ -348,8 +348,8 @@ def without_structure(
 ) -> list[StructuredModels]:
     """Aligned models and canonical ones, the better first for the `interpolator`.
 
-    The better alone, unless `every` one is asked for, or aligned ones where these are
-    told of.
+    Aligned ones alone where these are told of, or are the better and not `every` one
+    is asked for.
     """
     with retold() as told:
         aligned = restructure_points("aligned", local, points, runner, sampling_time)
@@ -374,7 +374,7 @@ def without_structure(
     models = _delayed(found.structure, found.theta, local)
     canonical = StructuredModels(points, local, *found, models, [], auto)
     ways = [canonical, aligned] if better else [aligned, canonical]
-    return ways if every else ways[:1]
+    return ways if every or better else ways[:1]
 
 
 def _delayed(
