@@ -57,12 +57,6 @@ _GROWN = 3.0  # time constants per record, up to which one that grows may be one
 # What fits experiments as methods do that take a table.
 _OF_READ = {"fit": "fit_experiments", "fit_each": "fit_each_experiment"}
 
-_TWICE = (  # advice for models of rates
-    "Where rates integrate as well, as the velocity of what nothing holds, have a "
-    "structure say so: restructurer=GrayBoxRestructurer(structure) with zeros in its "
-    "A. Else try "
-)
-
 ALTERNATES = "alternates"  # the kind of a warning, of poles on the negative real axis
 
 # States that a disturbance may have beside those of a structure: two resonances, or a
@@ -72,9 +66,36 @@ _OF_LOADS = 4
 # Decrease of the criterion from which they are taken: below it they were not better.
 _LIKELIER = 10.0
 
-_HELD = (
-    "If only its controller holds the plant, identify the closed loop, with the "
-    "controller's reference as input and the controller in the structure. "
+
+class Advice(NamedTuple):
+    """What to do about a model that grows."""
+
+    first: str = "Try "
+    of_rates: bool = False  # whose outputs are named
+    in_loop: bool = False
+
+    def text(self, named: str) -> str:
+        """With what is advised for outputs that integrate, `named`."""
+        held, enforced = "", "stability='enforce', "
+        if self.in_loop:  # as no plant is that only its controller holds
+            enforced = ""
+            held = (
+                "If only its controller holds the plant, identify the closed loop, "
+                "with the controller's reference as input and the controller in the "
+                "structure. "
+            )
+        return (
+            f"{named}{held}{self.first}local=SubspaceLTI(offset='linear') if the "
+            f"outputs drift, {enforced}another `order`, a longer `horizon` or more "
+            "data, or leave the point out by on_error='skip'."
+        )
+
+
+_TWICE = Advice(
+    "Where rates integrate as well, as the velocity of what nothing holds, have a "
+    "structure say so: restructurer=GrayBoxRestructurer(structure) with zeros in its "
+    "A. Else try ",
+    of_rates=True,
 )
 
 
@@ -182,7 +203,7 @@ def _pooled(
     fitted: Any,
     experiments: Sequence[Experiment],
     discretization: str,
-    advice: str,
+    advice: Advice,
     efficient: bool,
     about_zero: AboutZero,
     deviate: bool,
@@ -190,7 +211,7 @@ def _pooled(
     """That of one fit of all experiments of a point; options as in `identify_point`."""
     pairs = _deviated(fitted) if deviate else []
     if _from_closed_loop(fitted):
-        advice = _HELD + advice
+        advice = advice._replace(in_loop=True)
     rates = getattr(fitted, "rates_", None)
     if rates is None:
         lti = _continuous(fitted.lti_, discretization, advice, about_zero)
@@ -226,7 +247,7 @@ def _averaged(
     fitted: Mapping[Hashable, Any],
     experiments: Sequence[Experiment],
     discretization: str,
-    advice: str,
+    advice: Advice,
     efficient: bool,
     about_zero: AboutZero,
 ) -> LocalModel:
@@ -239,7 +260,7 @@ def _averaged(
     estimates: list[Estimate] = []
     for label, own in fitted.items():
         if not kept and _from_closed_loop(own):
-            advice = _HELD + advice
+            advice = advice._replace(in_loop=True)
         model, pairs = own.lti_, _deviated(own) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice, about_zero))
@@ -714,7 +735,7 @@ def _far_from_zero(records: Sequence[Array]) -> bool:
     return bool((np.abs(mean) > _OFFSET * np.sqrt(variance)).any())
 
 
-def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> str:
+def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> Advice:
     """What to try first if the model turns out unstable: offsets make it so.
 
     But for those that the estimator finds itself.
@@ -733,9 +754,9 @@ def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> str:
         if _far_from_zero(values)
     ]
     if not far or local.get_params(deep=False).get("offset") is not None:
-        return "Try "
+        return Advice()
     names, places = (" and ".join(words) for words in zip(*far, strict=True))
-    return (
+    return Advice(
         f"The {names} stand far from zero: subtract their value at rest from {places} "
         "(a simulation begins there), or let the local models find a constant: "
         "local=SubspaceLTI(offset='auto'). Else try "
@@ -766,7 +787,7 @@ class AboutZero(NamedTuple):
 
 
 def _continuous(
-    model: StateSpace, discretization: str, advice: str, about_zero: AboutZero
+    model: StateSpace, discretization: str, advice: Advice, about_zero: AboutZero
 ) -> StateSpace:
     with collected():  # said below
         lti = model.to_continuous(discretization)
@@ -776,14 +797,11 @@ def _continuous(
     elif growth > 0.0:
         worst = lti.poles()[np.argmax(lti.poles().real)]
         named = ""
-        if advice is not _TWICE:  # whose outputs are named
+        if not advice.of_rates:
             named = _integrating_outputs(lti, _GROWN * about_zero.rate)
         raise (Integrates if named else ValueError)(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. "
-            f"{named}{advice}"
-            "local=SubspaceLTI(offset='linear') if the outputs drift, "
-            "stability='enforce', another `order`, a longer `horizon` or more data, or "
-            "leave the point out by on_error='skip'."
+            f"{advice.text(named)}"
         )
     take_back("border")
     if lti.order > model.order:
