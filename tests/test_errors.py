@@ -259,7 +259,7 @@ TABLES = {
         lambda: LocalLPVPipeline(scheduling=2, experiment=3, sampling_time=1).fit(
             X[["force", "time", "kappa", "run"]].assign(time=0.0).to_numpy(), Y
         ),
-        ["Every input must vary", "'1' constant at 0"],
+        ["Every input must vary", "Got input 1 constant at 0"],
     ),
     "an output that never moves": (
         lambda: fit(y=0 * Y + 2),
