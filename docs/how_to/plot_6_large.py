@@ -34,7 +34,7 @@ local = SubspaceLTI(2, inputs=[0], experiment=1).fit_batches(batches())
 local.lti_.poles().round(3)
 
 # %%
-# 450 million such rows, 10 GB, took 206 s of one processor and 36 MB (:ref:`trust`).
+# 450 million such rows, 10 GB, took 99 s of one processor and 38 MB (:ref:`trust`).
 #
 # A data set on the disk
 # ----------------------
@@ -42,11 +42,11 @@ local.lti_.poles().round(3)
 # parquet files, or a folder of them, experiment by experiment; it wants pyarrow
 # (``pip install "lpvlearn[tables]"``). The rows of an experiment follow each other, in
 # the order of time; the other columns keep their roles. What `fit` finds in the whole
-# table, it finds too. Memory is that of the largest operating point, with
-# ``combine="average"`` of the largest experiment: 10 GB of parquet files, in 20 points
-# of 500 MB, took 309 s of one processor and 2.1 GB (:ref:`trust`). Both grow with the
-# rows alone: 100 GB are 35 minutes of a stream, and 52 minutes of files in 200 such
-# points, in the same memory.
+# table, it finds too. Memory is that of an experiment, and of 131,072 rows: 10 GB of
+# parquet files, in 20 points, took 138 s of one processor and 182 MB (:ref:`trust`). Of
+# a closed loop, and where the first rows tell too little of the others, it is that of
+# the largest operating point. Both times grow with the rows alone: 100 GB are 17
+# minutes of a stream, and 23 minutes of files, in the same memory.
 
 import tempfile
 from importlib.util import find_spec

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _OFTEN = 10  # moves of inputs that are no step test's
-_MANY = 300  # moves that tell the levels of inputs
+_MANY = 100  # moves that tell the levels of inputs
 _BRIEF = 0.5  # part of the samples that inputs of pulses are away from their level
 _SELDOM = 4  # moves of inputs that are one, whatever they begin with; pulses of few
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
@@ -72,9 +72,11 @@ def waiting(u: Array) -> int:
 
 def _left_for_good(u: Array, moves: NDArray[np.intp]) -> bool:
     """Whether inputs come back to every level that they move to, but not the first."""
+    if not _left(u[moves[0] + 1 :], u[0], u).all():
+        return False
     levels = u[moves[:_MANY] + 1]
-    returns = [np.count_nonzero(~_left(levels, level, u)) > 1 for level in levels]
-    return bool(all(returns) and _left(u[moves[0] + 1 :], u[0], u).all())
+    alike = np.abs(levels[:, None] - levels) <= _STILL * np.ptp(u, axis=0)
+    return bool((alike.all(axis=2).sum(axis=1) > 1).all())
 
 
 def moves_of(u: Array) -> NDArray[np.intp]:
