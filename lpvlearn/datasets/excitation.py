@@ -83,16 +83,19 @@ def prbs(
         check_count("n_samples", n_samples),
         check_count("n_channels", n_channels),
     )
-    if n_samples * n_channels > _MOST:
-        raise ValueError(
-            f"`n_samples` times `n_channels` must be at most {_MOST:g}. Got "
-            f"{float(n_samples) * n_channels:.4g}."
-        )
     clock, amplitude = check_count("clock", clock), check_size("amplitude", amplitude)
+    lengths = {"n_samples": n_samples}
     if balance is not None:
         balance = whole_number("balance", balance, 2, MOST_BITS)
         if balance % 2:
             raise ValueError(f"`balance` must be even, or None. Got {balance}.")
+        lengths["balance"] = balance  # whose windows are drawn whole
+    for name, length in lengths.items():
+        if length * n_channels > _MOST:
+            raise ValueError(
+                f"`{name}` times `n_channels` must be at most {_MOST:g}. Got "
+                f"{float(length) * n_channels:.4g}."
+            )
     rng = (
         random_state
         if isinstance(random_state, Generator)

@@ -476,6 +476,8 @@ def test_an_output_error_model_that_grows_within_its_range_is_told():
 def test_sequences_that_no_memory_holds_are_refused():
     with pytest.raises(ValueError, match="`n_samples` .* `n_channels`"):
         prbs(1_000_000, n_channels=1_000_000)
+    with pytest.raises(ValueError, match="`balance` times `n_channels` must be at"):
+        prbs(10, n_channels=1_000_000, balance=1_000_000)
 
 
 def test_numbers_near_the_smallest_make_no_warning_of_numpy():
