@@ -27,6 +27,7 @@ _HELD = 0.25
 
 _DIGITS = 3  # of a step that is taken from the data
 _SAME = 1e-6  # of a step: stamps closer than that are one
+_MOST_POINTS = 10**8  # of all grids: more is a mistake in a time
 _FINEST = 1000  # points of a grid for each sample: more is a mistake of units
 
 _AS_FINE = 1.05  # steps of the grid per mean step of the record that need no smoothing
@@ -147,6 +148,13 @@ def resample(
     n_fine = int(np.ceil(step / (_AS_FINE * own))) if antialias else 1
     gap = max_gap * max(step, float(own))
     grids = [_Grid(record, step, n_fine, gap, method) for record in records]
+    n_points = sum(float(r.seconds[-1] - r.seconds[0]) / step for r in records)
+    if n_points > _MOST_POINTS:
+        raise ValueError(
+            f"Column {stamps.name!r} must not span more than {_MOST_POINTS:,} steps in "
+            f"all. Got {n_points:.4g} of {step:.4g} s. Check its first and last "
+            "times, or give a longer `sampling_time`."
+        )
 
     roles = [stamps.name] + ([] if by_label is None else [by_label.name])
     levels = [

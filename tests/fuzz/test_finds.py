@@ -480,6 +480,13 @@ def test_sequences_that_no_memory_holds_are_refused():
         prbs(10, n_channels=1_000_000, balance=1_000_000)
 
 
+@pytest.mark.parametrize("end", [1e12, 1e16])
+def test_times_that_span_more_steps_than_memory_holds_are_refused(end):
+    X = pd.DataFrame({"t": [*np.arange(0.0, 50.0), end], "u": 1.0})
+    with pytest.raises(ValueError, match="must not span more than 100,000,000 steps"):
+        lp.resample(X, time="t")
+
+
 def test_numbers_near_the_smallest_make_no_warning_of_numpy():
     rng = np.random.default_rng(0)
     u = np.repeat(rng.choice([-1.0, 1.0], 60), 3)[:, None]

@@ -89,14 +89,16 @@ def error_at_order_two(records, truth, **options):
     "seeds", [(11,), pytest.param((22, 24, 25), marks=pytest.mark.slow)]
 )
 def test_a_load_has_states_of_its_own_beside_those_of_a_structure(seeds):
-    errors = []
+    """Or those of the structure are enough."""
+    orders, errors = [], []
     for seed in seeds:
         record, truth = two_lags_in_a_loop(seed, load=0.3)
         order, error = error_at_order_two([record], truth, most=True)
-        assert order > 2
+        orders.append(order)
         errors.append((error, error_at_order_two([record], truth)[1]))
-    with_load, without = np.mean(errors, axis=0)
-    assert with_load < min(0.1, 0.5 * without)
+        assert errors[-1][0] <= errors[-1][1]
+    assert max(orders) > 2
+    assert np.mean(errors, axis=0)[0] < 0.07
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from ...data.operating_points import OperatingPoints
 from ...exceptions import Told, collected, warn
 from ...subspace.estimator import SubspaceLTI
 from .common_delay import cost_with_delay, delay_in_samples
-from .local_models import ALTERNATES, LocalModel, integrates, is_left
+from .local_models import ALTERNATES, LocalModel, integrates
 
 # What is told of models that a delay is missing in: that, what else a model of a given
 # order may lack, and poles that alternate from sample to sample.
@@ -46,11 +46,8 @@ def with_delays(
     if not np.isfinite(own):  # of averages
         return estimator, local
     finding, found = clone(estimator).set_params(input_delay="auto"), list[LocalModel]()
-    some = clone(finding)
-    if is_left(some, "order"):  # a delay takes the place of states
-        some.set_params(order=range(max(m.order for m in local) + 1))
     with collected() as later, suppress(ValueError):
-        found = identify(some)[0]
+        found = identify(finding)[0]
     still = {one.kind for one in later} & kinds
     if len(found) < len(points) or ("delay" not in kinds and still):
         return estimator, local

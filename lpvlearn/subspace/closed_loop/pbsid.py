@@ -57,7 +57,12 @@ from ..samples.records import Record, ScaledRecords, output_energy, shorten
 from ..simulation_error.criterion import PRICE
 from ..simulation_error.noise import Whitening
 from ..simulation_error.simulation_fit import Freedom, Realization, simulation_fit
-from .plant_and_noise import ClosedLoopEvidence, split_modes, without_reached_noise
+from .plant_and_noise import (
+    ByInputs,
+    ClosedLoopEvidence,
+    split_modes,
+    without_reached_noise,
+)
 from .predictor import Found, Innovation, Predictor, prediction_errors, refine_predictor
 from .predictor_subspace import (
     PredictorSubspace,
@@ -219,7 +224,9 @@ def _told_apart(
         apart = joint.transformed(T)
         if fitted is None or kept.all():
             return _Together(fitted, apart, T, kept)
-        models = without_reached_noise(apart, fitted, T, kept, records, free)
+        models = without_reached_noise(apart, fitted, T, kept, free.direct)
+        if order is not None:  # else what is no noise would be told apart as well
+            models = [ByInputs.of(m, records, free).reaching(kept)[1] for m in models]
         apart, fewer = _likeliest(models, records, free), int((~kept).sum())
         if order is not None or _as_likely(apart, joint, fewer, records, n):
             return _Together(fitted, apart, T, kept)

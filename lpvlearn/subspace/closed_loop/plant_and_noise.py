@@ -273,26 +273,27 @@ def without_reached_noise(
     fitted: Predictor,
     transform: Array,
     kept: NDArray[np.bool_],
-    records: Sequence[Record],
-    free: Freedom,
+    direct: NDArray[np.bool_],
 ) -> list[Innovation]:
-    """Models given that no input reaches the noise, in B and D of least squares.
+    """Models given that no input reaches the noise: to first order, and as it is.
 
-    With A and C as they are, and as that tells of them to first order: where outputs
-    are of unequal quality, or poles nearly coincide, that may be worse than nothing.
+    The former where it is stable. Where outputs are of unequal quality, or poles nearly
+    coincide, the first order may be worse than none.
     """
-    direct = free.direct
     shift = _knowledge(fitted, joint, transform, kept, direct).shift
     n, (ny, m) = int(kept.sum()), direct.shape
+    A, B, C, D = (M.copy() for M in joint[:4])
+    B[~kept] = 0.0
+    as_it_is = joint._replace(B=B.copy())
     ends = np.cumsum([n * m, direct.sum(), n * n])
-    *_, by_A, by_C = np.split(shift, ends)
-    A, C = joint.A.copy(), joint.C.copy()
+    by_B, by_D, by_A, by_C = np.split(shift, ends)
+    B[kept] += by_B.reshape(n, m)
+    D[direct] += by_D
     A[np.ix_(kept, kept)] += by_A.reshape(n, n)
     C[:, kept] += by_C.reshape(ny, n)
-    models = [joint]
-    if spectral_radius(A - joint.K @ C) < 1.0:
-        models.append(joint._replace(A=A, C=C))
-    return [ByInputs.of(model, records, free).reaching(kept)[1] for model in models]
+    moved = joint._replace(A=A, B=B, C=C, D=D)
+    stable = spectral_radius(A - joint.K @ C) < 1.0
+    return [moved, as_it_is] if stable else [as_it_is]
 
 
 def _modes(A: Array) -> tuple[Array, list[NDArray[np.bool_]]]:
