@@ -80,7 +80,7 @@ def simulation_std(model: LPVStateSpace, u: Array, kappa: Array, dt: float) -> A
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of models that grow beyond all numbers
-def levels_of(errors: Iterable[Array], left_out: Iterable[Array] = ()) -> Levels:
+def levels_of(errors: Iterable[Array], left_out: Sequence[Array] = ()) -> Levels:
     """Noise and model error behind simulation errors (n_samples, n_outputs) of records.
 
     The level of the quietest of eight bands of frequencies, and of those that are as

@@ -501,8 +501,7 @@ class SubspaceLTI(ScoredFromRest):
         telling = Telling(*(names or _labels_of(X, experiments, y)))
         if names:
             telling = telling.aside("noisy output", "useless", "dropouts")
-        self._fit_whole(experiments, choices, telling)
-        self._name(*_names_of(experiments, y))
+        self._fit_whole(experiments, choices, telling, _names_of(experiments, y))
         return self
 
     @all_or_nothing
@@ -534,12 +533,15 @@ class SubspaceLTI(ScoredFromRest):
         choices = check_options(self.get_params(deep=False))
         names = _names_read(experiments)
         self._single_output = False
-        self._fit_whole([*experiments], choices, Telling(*names))
-        self._name(*names)
+        self._fit_whole([*experiments], choices, Telling(*names), names)
         return self
 
     def _fit_whole(
-        self, experiments: list[Experiment], choices: Choices, telling: Telling
+        self,
+        experiments: list[Experiment],
+        choices: Choices,
+        telling: Telling,
+        names: tuple[Any, Any],
     ) -> None:
         """Identify the model of experiments in which samples may be missing."""
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
@@ -551,6 +553,7 @@ class SubspaceLTI(ScoredFromRest):
             warn_of_many_pieces(experiments)
         delay = self._delay_of(experiments, choices)
         self._identify(experiments, choices, delay, telling)
+        self._name(*names)
 
     def _learn(
         self,
@@ -614,10 +617,8 @@ class SubspaceLTI(ScoredFromRest):
         experiments = first._read(X, y, reset=True, cut=False)
         first._remember_shape(y)
         telling = Telling(*_labels_of(X, experiments, y))
-        models = first._fit_apart(experiments, choices, telling)
-        for model in models:
-            model._name(*_names_of(experiments, y))
-        return models
+        names = _names_of(experiments, y)
+        return first._fit_apart(experiments, choices, telling, names)
 
     def fit_each_experiment(self, experiments: Sequence[Experiment]) -> list[Self]:
         """As `fit_each`, of experiments that have been read, as `fit_experiments`.
@@ -639,13 +640,14 @@ class SubspaceLTI(ScoredFromRest):
         choices = choices_of_each(self.get_params(deep=False))
         first, names = clone(self), _names_read(experiments)
         first._single_output = False
-        models = first._fit_apart([*experiments], choices, Telling(*names))
-        for model in models:
-            model._name(*names)
-        return models
+        return first._fit_apart([*experiments], choices, Telling(*names), names)
 
     def _fit_apart(
-        self, experiments: list[Experiment], choices: Choices, telling: Telling
+        self,
+        experiments: list[Experiment],
+        choices: Choices,
+        telling: Telling,
+        names: tuple[Any, Any],
     ) -> list[Self]:
         """This one, fitted to the first experiment, and copies for the others."""
         others = [copy(self) for _ in experiments[1:]]
@@ -654,6 +656,8 @@ class SubspaceLTI(ScoredFromRest):
         telling.kinds |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, telling, known)
+        for model in (self, *others):
+            model._name(*names)
         return [self, *others]
 
     @one_blas_thread

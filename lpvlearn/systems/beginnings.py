@@ -43,10 +43,10 @@ def standing(u: Array) -> int:
     return n if n >= _STANDING else 0
 
 
-def _left(u: Array, level: Array, among: Array | None = None) -> NDArray[np.bool_]:
-    """Which samples are far from a level, by the range of all, or of those `among`."""
+def _left(u: Array, level: Array) -> NDArray[np.bool_]:
+    """Which samples are far from a level, by the range of all."""
     with np.errstate(over="ignore"):
-        far = np.abs(u - level) > _STILL * np.ptp(u if among is None else among, axis=0)
+        far = np.abs(u - level) > _STILL * np.ptp(u, axis=0)
     return np.asarray(far.any(axis=1))
 
 
@@ -72,10 +72,11 @@ def waiting(u: Array) -> int:
 
 def _left_for_good(u: Array, moves: NDArray[np.intp]) -> bool:
     """Whether inputs come back to every level that they move to, but not the first."""
-    if not _left(u[moves[0] + 1 :], u[0], u).all():
+    if not _left(u, u[0])[moves[0] + 1 :].all():
         return False
     levels = u[moves[:_MANY] + 1]
-    alike = np.abs(levels[:, None] - levels) <= _STILL * np.ptp(u, axis=0)
+    with np.errstate(over="ignore"):
+        alike = np.abs(levels[:, None] - levels) <= _STILL * np.ptp(u, axis=0)
     return bool((alike.all(axis=2).sum(axis=1) > 1).all())
 
 

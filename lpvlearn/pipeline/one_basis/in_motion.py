@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...data.operating_points import OperatingPoints
 from ...exceptions import warn
 from ...lpv.model import LPVStateSpace
-from ...systems.simulation import spread_of
+from ..points.local_models import motions
 
 Array = NDArray[np.float64]
 
@@ -42,12 +42,12 @@ def tell_of_other_states(
         return (1.0 - share) * known[before, rows] + share * known[before + 1, rows]
 
     kappa = along([np.broadcast_to(row, (n, len(row))) for row in points.kappa])
-    u = along([_motion(e.inputs)[:n] for e in runs])
+    u = along([(e.inputs - e.inputs.mean(axis=0))[:n] for e in runs])
     y, z = (
         m.simulate(u + m.input_offset(kappa), kappa, sampling_time=dt)
         for m in (model.silenced(), other.silenced())
     )
-    size = spread_of(np.vstack([_motion(e.measured) for e in runs]))
+    _, (_, size) = motions(runs)
     apart = np.sqrt(np.mean((y - z) ** 2, axis=0)) / size
     k = int(np.argmax(apart))
     if apart[k] > _APART:
@@ -61,7 +61,3 @@ def tell_of_other_states(
             "these. Give an experiment that moves so, with refiner=OutputErrorLPV(), "
             "which decides; or a structure; or compare with restructurer='aligned'."
         )
-
-
-def _motion(signal: Array) -> Array:
-    return np.asarray(signal - np.nanmean(signal, axis=0))

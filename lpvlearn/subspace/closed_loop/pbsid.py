@@ -220,13 +220,14 @@ def _told_apart(
         split = split_modes(joint, fitted, order, records, free, n)
         if split is None:
             continue
-        T, kept = split
+        T, kept, by_inputs = split
         apart = joint.transformed(T)
         if fitted is None or kept.all():
             return _Together(fitted, apart, T, kept)
         models = without_reached_noise(apart, fitted, T, kept, free.direct)
-        if order is not None:  # else what is no noise would be told apart as well
-            models = [ByInputs.of(m, records, free).reaching(kept)[1] for m in models]
+        if by_inputs is not None:  # else what is no noise would be told apart as well
+            moved = [ByInputs.of(model, records, free) for model in models[:-1]]
+            models = [some.reaching(kept)[1] for some in (*moved, by_inputs)]
         apart, fewer = _likeliest(models, records, free), int((~kept).sum())
         if order is not None or _as_likely(apart, joint, fewer, records, n):
             return _Together(fitted, apart, T, kept)

@@ -174,6 +174,7 @@ class _Split(NamedTuple):
 
     transform: Array
     kept: NDArray[np.bool_]
+    by_inputs: ByInputs | None = None  # in these coordinates, of a given order
 
 
 class ByInputs(NamedTuple):
@@ -265,7 +266,9 @@ def split_modes(
     speak = [
         r > limit and not kept[m].all() for r, m in zip(reached, modes, strict=True)
     ]
-    return None if any(speak) or kept.sum() < order else _Split(T, kept)
+    if any(speak) or kept.sum() < order:
+        return None
+    return _Split(T, kept, by_inputs)
 
 
 def without_reached_noise(
