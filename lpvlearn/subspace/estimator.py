@@ -765,7 +765,6 @@ class SubspaceLTI(ScoredFromRest):
             return rates
         return rates if is_poorer(sums._evidence, sums.lti_, rates.lti_) else sums
 
-    @all_or_nothing
     def partial_fit(self, X: Any, y: Any) -> Self:
         """Go on with the next batch of a stream, in memory independent of its length.
 
@@ -803,8 +802,8 @@ class SubspaceLTI(ScoredFromRest):
         Notes
         -----
         The model is the one that `fit` finds from all batches as one table, however
-        they are cut. It is made where the samples have doubled, and in between when
-        somebody asks for it (``model.lti_``), and may warn then: batches may be small.
+        they are cut. It is made as soon as there are samples enough, then when somebody
+        asks for it (``model.lti_``), and may warn, or fail, then: batches may be small.
         The first 131,072 samples are kept (the last ones where the first do not make a
         model). Then order and horizon stay, and only summaries grow: the compressed
         Hankel data, and
@@ -833,11 +832,18 @@ class SubspaceLTI(ScoredFromRest):
         >>> model.lti_.poles().round(6)
         array([0.9+0.j])
         """
-        before = getattr(self, "_stream", None)
+        own = self.__dict__
+        stream = own.get("_stream")
+        if stream is None or not stream.takes(X, y, own):
+            return self._read_batch(X, y, stream)
+        if "lti_" in own:
+            self._forget_for_now()
+        return self
+
+    @all_or_nothing
+    def _read_batch(self, X: Any, y: Any, before: SampleStream | None) -> Self:
+        """As `partial_fit`, of a batch in which something may be to be told."""
         if before is not None:
-            stream = before.with_numbers(X, y, self.__dict__)
-            if stream is not None:
-                return self._go_on(stream)
             before.check_options(self.__dict__)
         options = self.get_params(deep=False)
         choices: Any = choices_of_stream(options) if before is None else None
@@ -872,16 +878,24 @@ class SubspaceLTI(ScoredFromRest):
         fitted = stream.add(experiments, Table(X).one(self.time, "time"))
         if fitted is not None:
             self._take_up(fitted, stream)
-        return self._go_on(stream)
-
-    def _go_on(self, stream: SampleStream) -> Self:
-        """Have what a stream does not tell yet wait for someone to ask for it."""
         self._stream = stream
-        if stream.waits and "lti_" in self.__dict__:  # see __getattr__
-            known = [name for name in _TAKEN if name in self.__dict__]
-            stale = {name: self.__dict__.pop(name) for name in known}
-            self._stale = self.__dict__.get("_stale", {}) | stale
+        if stream.waits and "lti_" in self.__dict__:
+            self._forget_for_now()
         return self
+
+    def _forget_for_now(self) -> None:
+        """Have what the stream does not tell yet wait for someone to ask for it."""
+        known = [name for name in _TAKEN if name in self.__dict__]
+        stale = {name: self.__dict__.pop(name) for name in known}
+        self._stale = self.__dict__.get("_stale", {}) | stale  # see __getattr__
+
+    def __copy__(self) -> Self:
+        """As of any object, but for the stream, to which batches are added in place."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        if other.__dict__.get("_stream") is not None:
+            other._stream = cast(SampleStream, self._stream).branch()
+        return other
 
     @all_or_nothing
     def fit_batches(self, batches: Iterable[tuple[Any, Any]]) -> Self:

@@ -144,6 +144,7 @@ def batches(size):
     with Cost() as cost:
         for k in range(0, n_rows, size):
             model.partial_fit(u[k : k + size], y[k : k + size])
+        assert model.lti_.order == 4  # of all rows
     return f"{cost.seconds:6.2f} s"
 
 

@@ -425,11 +425,16 @@ def test_errors_of_the_linear_algebra_are_not_taken_for_few_samples(
         raise np.linalg.LinAlgError("SVD did not converge")
 
     u, y = record(system, 900)
-    model = SubspaceLTI(5, horizon=8).partial_fit(u[:300], y[:300])
+    model = SubspaceLTI(5, horizon=8)
     with monkeypatch.context() as patched:
         patched.setattr("lpvlearn.subspace.fits.one_fit.identify", diverge)
-        refused(model, u[300:], y[300:], "did not converge")
-    model.partial_fit(u[300:], y[300:])
+        refused(model, u[:300], y[:300], "did not converge")
+    model.partial_fit(u[:300], y[:300]).partial_fit(u[300:], y[300:])
+    with monkeypatch.context() as patched:
+        patched.setattr("lpvlearn.subspace.fits.one_fit.identify", diverge)
+        for _ in range(2):  # whoever asks is told, and may ask again
+            with pytest.raises(ValueError, match="did not converge"):
+                model.predict(u)
     whole = SubspaceLTI(5, horizon=8).fit(u, y)
     np.testing.assert_allclose(response(model), response(whole), rtol=1e-9)
 
@@ -609,12 +614,12 @@ def test_small_batches_make_few_models_and_the_same(system, monkeypatch):
     )
     u, y = record(system, 900)
     model = fed(SubspaceLTI(5, horizon=8), u, y, [5] * 180)
-    assert len(made) <= 10  # doublings of 5 samples, each of which tries for a model
+    assert len(made) <= 6  # doublings of 5 samples, until there is a model
     copies = pickle.loads(pickle.dumps(model)), model
     whole = SubspaceLTI(5, horizon=8).fit(u, y)
     for one in copies:
         np.testing.assert_allclose(response(one), response(whole), rtol=1e-9)
-    assert len(made) <= 12 and not hasattr(model, "no_such_attribute_")
+    assert len(made) <= 8 and not hasattr(model, "no_such_attribute_")
 
 
 def test_branches_of_a_stream_leave_each_other_alone(system):
@@ -649,7 +654,7 @@ def test_single_rows_of_tables_wait_where_their_labels_tell_nothing(system):
     model, series = SubspaceLTI(3, horizon=4), pd.Series(y[:, 0], name="p")
     for k in range(300):
         model.partial_fit(X[k : k + 1], series[k : k + 1])
-    assert model._stream._n_waiting == 300 - 256  # the model is of the others
+    assert model._stream._n_waiting >= 300 - 32  # the first model is of fewer
     refused(model, X[["a"]][:1], series[:1], "must have the columns")
     refused(model, X[:2], series[1:3].set_axis([0, 7]), "must have the row labels")
     model.partial_fit(X[["b", "a"]], series)

@@ -14,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from copy import copy, deepcopy
 from itertools import pairwise
+from math import hypot
 from numbers import Integral
-from operator import is_
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -57,11 +58,10 @@ Array = NDArray[np.float64]
 # for a model that the rest can be linearised around, and a second or two of work.
 BUFFER = 131_072
 
-# Samples after which another model is due when summaries grow. Before, as many as the
-# last one was made of: all attempts together cost twice the last one. Fewer may wait.
+# Samples after which another model is due when summaries grow. Fewer may wait.
 _DUE = 4_096
 
-_LARGEST = SQUARED**2  # sum of squares of a batch: no number is too large below it
+_FLOAT = np.dtype(float)
 
 # Share of the buffer that is given up at once where no model can be made of it: so that
 # not every batch is worth another attempt.
@@ -296,11 +296,15 @@ class SampleStream:
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
         self._n_new, self._n_fitted = 0, 0  # samples since, and of, the last attempt
+        self._has_model = False  # whether that found one
         # Whether tables are read as they are: all columns are inputs.
         self._plain = all(options[role] is None for role in ROLES)
         self._named = not any(isinstance(name, Integral) for name in self._names)
-        self._waiting: list[tuple[Array, Array]] = []  # of which branches share what
-        self._n_batches, self._n_waiting = 0, 0  # is before both; samples of ours
+        # Numbers of inputs and outputs in turn, as bytes: of these the collector of
+        # garbage makes nothing. For how many samples more there is room.
+        self._waiting: list[bytes] = []
+        self._left = 0
+        self._values, self._began = itemgetter(*options), (*self._options.values(),)
 
     @property
     def step(self) -> float:
@@ -316,46 +320,45 @@ class SampleStream:
         other = copy(self)
         other._telling, other._clock = self._telling.aside(), copy(self._clock)
         other._buffer, other._summary = self._buffer.branch(), copy(self._summary)
-        if self._n_waiting:
-            batches = zip(*self._waiting[: self._n_batches], strict=True)
-            u, y = (np.concatenate(parts) for parts in batches)
-            other._waiting, other._n_batches, other._n_waiting = [], 0, 0
+        other._waiting = []
+        if self._waiting:
+            inputs, outputs = (b"".join(self._waiting[k::2]) for k in (0, 1))
+            u = np.frombuffer(inputs).reshape(-1, len(self._names))
+            y = np.frombuffer(outputs).reshape(-1, self._n_outputs)
             other._take_up([Experiment(0, np.arange(len(u)), u, y)], None)
         return other
 
-    def with_numbers(
-        self, X: Any, y: Any, options: Mapping[str, Any]
-    ) -> SampleStream | None:
-        """A stream that goes on with a batch, which waits for others to be taken up.
+    def takes(self, X: Any, y: Any, options: Mapping[str, Any]) -> bool:
+        """Whether a batch may wait for others to be taken up; from now on it does.
 
-        None where there is something to read, to refuse or to do: the batch is not
+        Not where there is something to read, to refuse or to do: the batch is not
         simply inputs and outputs, arrays or tables as the first ones were, `options`
         are not those that the stream began with, or enough samples wait.
         """
-        outputs = self.names[1]
-        if self._named and (
-            outputs is None or list(getattr(y, "columns", outputs)) == [*outputs]
-        ):
-            X, y = _without_labels(X, y, self._names)
-        if not (type(X) is type(y) is np.ndarray and X.dtype == y.dtype == np.float64):
-            return None
-        m, ny = len(self._names), self._n_outputs
-        n = y.shape[0] if y.ndim else 0
-        if X.shape != (n, m) or y.shape[1:] not in ((ny,), () if ny == 1 else (ny,)):
-            return None
-        n_waiting, energy = self._n_waiting + n, np.vdot(X, X) + np.vdot(y, y)
-        if not (0 < n and n_waiting < self._room and energy < _LARGEST):
-            return None
-        began, now = self._options.values(), [options[name] for name in self._options]
-        if not (all(map(is_, now, began)) or all(map(_same, now, began))):
-            return None
-        other = object.__new__(SampleStream)  # a tenth of the time of copy()
-        other.__dict__.update(self.__dict__)
-        if len(self._waiting) > self._n_batches:  # another branch went on from here
-            other._waiting = self._waiting[: self._n_batches]
-        other._waiting.append((X.copy(), y.reshape(n, ny).copy()))
-        other._n_batches, other._n_waiting = self._n_batches + 1, n_waiting
-        return other
+        if self._named:
+            X, y = _without_labels(X, y, self._names, self.names[1])
+        if not (type(X) is type(y) is np.ndarray and X.dtype is y.dtype is _FLOAT):
+            return False
+        n, ny = len(y) if y.ndim else 0, self._n_outputs
+        if X.shape != (n, len(self._names)):
+            return False
+        if y.shape != (n, ny) and (ny > 1 or y.ndim > 1):
+            return False
+        left = (self._left if self._waiting else self._room) - n
+        if not (n and left > 0):
+            return False
+        now, began = self._values(options), self._began
+        try:
+            as_it_began = now == began
+        except ValueError:  # arrays among them
+            as_it_began = all(map(_same, now, began))
+        if not as_it_began:
+            return False
+        if not hypot(*X.flat, *y.flat) < SQUARED:  # or some are missing
+            return False
+        self._waiting += X.tobytes(), y.tobytes()  # at once, whoever interrupts
+        self._left = left
+        return True
 
     @property
     def _room(self) -> int:
@@ -369,8 +372,14 @@ class SampleStream:
 
     @property
     def _due(self) -> int:
-        """Samples since the last attempt at a model with which another one is due."""
-        return self._n_fitted if self._summary is None else _DUE
+        """Samples since the last attempt at a model with which another one is due.
+
+        As many as that was made of until one succeeds: all attempts together cost twice
+        the last one. Then none before the buffer is full, where summaries begin.
+        """
+        if self._summary is not None:
+            return _DUE
+        return BUFFER if self._has_model else self._n_fitted
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         """Refuse options other than those the stream began with."""
@@ -387,11 +396,11 @@ class SampleStream:
     ) -> LocalFit | None:
         """Take up a batch: its experiments by appearance, and the times of its rows.
 
-        The model of all samples, where as many came since the last attempt that another
-        is due: so that small batches cost no more than large ones. Else None, and `fit`
-        tells it when it is asked for. After a ValueError (other outputs than in the
-        first batch, an experiment that does not go on evenly in time) this stream must
-        be left: go on from the one that it branched off.
+        The model of all samples, where another one is due. Else None, and `fit` tells
+        it when it is asked for: so that batches cost no more for being small. After a
+        ValueError (other outputs than in the first batch, an experiment that does not
+        go on evenly in time) this stream must be left: go on from the one that it
+        branched off.
         """
         n_outputs = experiments[0].measured.shape[1]
         if n_outputs != self._n_outputs:
@@ -420,6 +429,10 @@ class SampleStream:
         return fitted
 
     @property
+    def _n_waiting(self) -> int:
+        return sum(map(len, self._waiting[1::2])) // (8 * self._n_outputs)
+
+    @property
     def n_samples(self) -> int:
         """How many came, without those that gaps left alone."""
         return self._n_fitted + self._n_new + self._n_waiting
@@ -427,14 +440,16 @@ class SampleStream:
     @property
     def waits(self) -> bool:
         """Whether samples came that the last attempt at a model does not know."""
-        return self._n_new + self._n_waiting > 0
+        return bool(self._waiting) or self._n_new > 0
 
     def fit(self) -> LocalFit | None:
         """The model of all samples taken up; None where they are still too few."""
         self._n_fitted, self._n_new = self._n_fitted + self._n_new, 0
         if self._summary is not None:
             return self._fit_summaries(self._summary)
-        return self._fit_kept([])[0]
+        fitted, _ = self._fit_kept([])
+        self._has_model = fitted is not None
+        return fitted
 
     def _cut(
         self, experiments: Sequence[Experiment], times: Column | None
@@ -510,9 +525,13 @@ class SampleStream:
         return fitted
 
 
-def _without_labels(X: Any, y: Any, names: Sequence[Hashable]) -> tuple[Any, Any]:
-    """A table of these columns as arrays, where its labels tell nothing; else None."""
-    if type(X) is not pd.DataFrame or tuple(X.columns) != names:
+def _without_labels(
+    X: Any, y: Any, inputs: Sequence[Hashable], outputs: Sequence[Hashable] | None
+) -> tuple[Any, Any]:
+    """Tables of these columns as arrays, where their labels tell nothing; else None."""
+    if type(X) is not pd.DataFrame or tuple(X.columns) != inputs:
+        return None, None
+    if outputs is not None and list(getattr(y, "columns", outputs)) != [*outputs]:
         return None, None
     ordered = isinstance(X.index, pd.RangeIndex) and X.index.step > 0
     if type(y) in (pd.DataFrame, pd.Series) and X.index.equals(y.index):
