@@ -214,7 +214,7 @@ def read_experiments(
         ],
     )
     if by_time is None:
-        warn_of_disorder(X, groups)
+        warn_of_disorder(X, groups, sampling_time or fitted_step)
     if reset and roles["inputs"] is None:
         warn_of_forgotten_roles(U, names, groups, roles)
     if reset and table.named and Y is not None:

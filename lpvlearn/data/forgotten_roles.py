@@ -34,7 +34,14 @@ _ALIKE = 100  # samples from which columns that agree to the bit are one
 
 DISORDER = "disorder"  # the kind of warnings of rows: of these comes what else is told
 
-_ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
+# Types of an index that tells times, an order, and, of even numbers, what is missing
+_DATES = ("datetime64", "timedelta64")
+_ORDERED = ("integer", *_DATES)
+_TELLING = (*_ORDERED, "floating")
+
+_OFF = 0.1  # of a step, by which those of an index may be off whole ones
+
+_NAME_IT = "Name it by `time=` (an index gets a name by rename_axis of pandas)"
 
 _HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
 _LEVELS = 3  # that make a count; two are a step, the commonest input of all
@@ -113,51 +120,88 @@ def refuse_outputs_among_inputs(
             )
 
 
-def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
+def warn_of_disorder(
+    X: Any, groups: Sequence[Indices], sampling_time: float | None = None
+) -> None:
     """Warn of rows not in the order of their numbers or dates, the index, or torn.
 
     Labels that stand twice (tables below each other) tell nothing. Numbers that mostly
     go on by the same step, and elsewhere by some of them, tell that rows are missing
-    there, unless the labels in between are those of other experiments.
+    there, unless the labels in between are those of other experiments. Dates tell the
+    step, too, which the `sampling_time` (seconds) is to be.
     """
     index = getattr(X, "index", None)
-    if not isinstance(index, pd.Index) or index.inferred_type not in _ORDERED:
+    if not isinstance(index, pd.Index) or index.inferred_type not in _TELLING:
         return
+    numbers = _as_numbers(index)
     for rows in groups:
         labels = index[rows]
-        if labels.is_unique and not labels.is_monotonic_increasing:
-            later = int(np.argmin(labels[1:] > labels[:-1])) + 1
+        if index.inferred_type in _ORDERED and labels.is_unique:
+            if not labels.is_monotonic_increasing:
+                _tell_of_order(labels)
+                return
+        steps = np.diff(numbers[rows])
+        if len(steps) < _FEWEST or not (steps > 0.0).all():
+            continue
+        step = float(np.median(steps[steps < 1.5 * steps.min()]))
+        torn = np.flatnonzero(steps > 1.5 * step)
+        off = np.abs(steps / step - np.rint(steps / step))
+        if len(torn) > (1.0 - _WHOLE) * len(steps) or not (off < _OFF).all():
+            continue  # it goes on in no steps that are alike
+        dates = index.inferred_type in _DATES
+        if dates and sampling_time and abs(step / sampling_time - 1.0) > _OFF:
             warn(
-                "The rows of X are not in the order of its index: "
-                f"{labels[later]!s} comes after {labels[later - 1]!s}. A dynamic model "
-                "needs the samples in the order of time. If they were shuffled, sort "
-                "them (sort_index of pandas) and split by experiment with "
-                "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
-                "means nothing, drop it (reset_index).",
+                f"The index of X goes on by {step:.6g} s, and `sampling_time` is "
+                f"{sampling_time:.6g} s: one of them is wrong. {_NAME_IT}; if the "
+                "index means nothing, drop it (reset_index).",
                 kind=DISORDER,
             )
             return
-        if index.inferred_type == "integer" and len(labels) > _FEWEST:
-            numbers = labels.to_numpy().astype(np.float64)
-            steps = np.diff(numbers)
-            least = steps.min()
-            torn = np.flatnonzero(steps > least)
-            of_holes = len(steps) - len(torn) >= _WHOLE * len(steps)
-            if len(torn) and of_holes and not (steps % least).any():
-                next_ones = numbers[torn] + least
-                if index.isin(next_ones).sum() > len(torn) // 2:
-                    continue  # rows of experiments take turns
-                where = int(torn[0])
-                warn(
-                    "Rows of X are missing within an experiment: its index goes from "
-                    f"{labels[where]} to {labels[where + 1]}. To a model the record "
-                    "goes on there. Split by experiment (ExperimentSplit) or in time "
-                    "(BlockedTimeSeriesSplit), not by KFold; of rows that were dropped "
-                    "name the `time` and use missing='split'; if the index means "
-                    "nothing, drop it (reset_index).",
-                    kind=DISORDER,
+        beside = _are_among(numbers, numbers[rows][torn] + step, _OFF * step)
+        if len(torn) and not beside.sum() > len(torn) // 2:  # no others take turns
+            where = int(torn[0])
+            warn(
+                "Rows of X are missing within an experiment: its index goes from "
+                f"{labels[where]} to {labels[where + 1]}. To a model the record goes "
+                "on there. Split by experiment (ExperimentSplit) or in time "
+                "(BlockedTimeSeriesSplit), not by KFold; of rows that were dropped "
+                + (
+                    f"the index tells the times: use missing='split'. {_NAME_IT}; if "
+                    if dates
+                    else "name the `time` and use missing='split'; if "
                 )
-                return
+                + "the index means nothing, drop it (reset_index).",
+                kind=DISORDER,
+            )
+            return
+
+
+def _tell_of_order(labels: pd.Index) -> None:
+    later = int(np.argmin(labels[1:] > labels[:-1])) + 1
+    warn(
+        "The rows of X are not in the order of its index: "
+        f"{labels[later]!s} comes after {labels[later - 1]!s}. A dynamic model "
+        "needs the samples in the order of time. If they were shuffled, sort "
+        "them (sort_index of pandas) and split by experiment with "
+        "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
+        "means nothing, drop it (reset_index).",
+        kind=DISORDER,
+    )
+
+
+def _as_numbers(index: pd.Index) -> Array:
+    """Labels as numbers: dates as seconds, of which an index has whole nanoseconds."""
+    if isinstance(index, pd.DatetimeIndex | pd.TimedeltaIndex):
+        since = (index - index.min()).to_numpy("timedelta64[ns]")
+        return np.asarray(since.astype(np.int64) * 1e-9)
+    return np.asarray(index.to_numpy(dtype=np.float64, na_value=np.nan))
+
+
+def _are_among(numbers: Array, wanted: Array, within: float) -> NDArray[np.bool_]:
+    """Which of the `wanted` numbers are there, or others so near."""
+    ordered = np.append(np.sort(numbers), np.inf)
+    found = ordered[np.searchsorted(ordered[:-1], wanted - within)]
+    return np.asarray(found <= wanted + within)
 
 
 def _typical_step(column: Array) -> float:

@@ -208,6 +208,8 @@ class Table:
             known += f"; index levels: {', '.join(named)}" if named else ""
             rule = f"name a column or an index level of X ({known})"
         hint = did_you_mean(key, [*self.names, *self.levels])
+        if role == "time" and None in self.levels and not is_position:
+            hint += " An index without a name gets one by X.rename_axis('time')."
         raise ValueError(f"`{role}` must {rule}. Got {shown(key)}.{hint}")
 
     def one(self, key: Any, role: str) -> Column | None:

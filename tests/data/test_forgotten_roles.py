@@ -164,8 +164,17 @@ def test_shuffled_rows_are_told_in_predictions_too():
         model.predict(X.sample(frac=1, random_state=0))
 
 
-def test_rows_that_are_missing_are_told():
-    u = pd.DataFrame({"u": np.arange(300.0) ** 2 % 7})
+OF_INDEX = [
+    np.arange(300),
+    0.1 * np.arange(300),
+    pd.date_range("2025-03-29", periods=300, freq="h", tz="Europe/Berlin"),
+    pd.to_timedelta(np.arange(300), unit="D"),
+]
+
+
+@pytest.mark.parametrize("index", OF_INDEX, ids=["numbers", "floats", "dates", "days"])
+def test_rows_that_are_missing_are_told(index):
+    u = pd.DataFrame({"u": np.arange(300.0) ** 2 % 7}, index=pd.Index(index))
 
     def torn(rows, **roles):
         told = warned(rows, inputs=["u"], reset=True, **roles)
@@ -173,10 +182,12 @@ def test_rows_that_are_missing_are_told():
 
     parts = u.iloc[np.r_[0:100, 200:300]]
     (message,) = torn(parts)
-    assert "from 99 to 200" in message and "ExperimentSplit" in message
+    assert f"from {u.index[99]} to {u.index[200]}" in message
+    assert "ExperimentSplit" in message
     for rows in (slice(100, 300), slice(0, 300, 3)):
         assert torn(u.iloc[rows]) == []
-    assert torn(parts.assign(run=parts.index // 150), experiment="run") == []
+    runs = np.repeat([0, 1], 100)
+    assert torn(parts.assign(run=runs), experiment="run") == []
     # a tenth or a half at random, as dropna leaves them; of every third row, too
     rng = np.random.default_rng(0)
     for share in (0.1, 0.5):
@@ -185,7 +196,25 @@ def test_rows_that_are_missing_are_told():
     # rows of two experiments that take turns, and numbers that mean nothing
     turns = u.assign(run=rng.integers(2, size=300))
     assert torn(turns, experiment="run") == []
-    assert torn(u.set_index(np.cumsum(rng.integers(1, 100, size=300)))) == []
+
+
+def test_numbers_of_an_index_that_mean_nothing_tell_nothing():
+    rng = np.random.default_rng(0)
+    for index in (np.cumsum(rng.integers(1, 100, size=300)), rng.normal(size=300)):
+        assert warned(pd.DataFrame({"u": rng.normal(size=300)}, index=index)) == []
+
+
+def test_dates_of_an_index_tell_the_step():
+    u = pd.DataFrame({"u": np.arange(300.0) ** 2 % 7}, index=OF_INDEX[2])
+    y, step = np.roll(u["u"].to_numpy(), 1), 3600.0
+    model = SubspaceLTI(1, horizon=3, sampling_time=step).fit(u, y)
+    model.predict(u)
+    with pytest.warns(UserWarning, match="goes on by 3600 s, and `sampling_time` is 1"):
+        SubspaceLTI(1, horizon=3, sampling_time=1.0).fit(u, y)
+    with pytest.warns(UserWarning, match="goes on by 7200 s.*`sampling_time` is 3600"):
+        model.predict(u[::2])
+    with pytest.raises(ValueError, match=r"without a name gets one by X.rename_axis"):
+        SubspaceLTI(1, time="index").fit(u, y)
 
 
 def test_an_output_left_in_the_table_is_refused():
