@@ -44,6 +44,7 @@ from ..validation import (
     whole_number,
 )
 from .deadline import bounded, time_is_up
+from .equal_optima import are_apart, as_good
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import (
@@ -474,6 +475,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.params_covariance_ = at.covariance_of_noise(_DRAWS, seed)
             self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
         self._tell_of_nonlinear(at)
+        self._tell_of_others(problem)
         self.n_features_in_ = 1
         return self
 
@@ -698,6 +700,30 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             doubted = not (guessed or found.certain)
             self._warn(problem, result, enough, doubted, hurried, settled)
         return at
+
+    def _tell_of_others(self, problem: RestructuringProblem) -> None:
+        """Tell of other parameters with the same response, but of open ones."""
+        theta, names = self.start_params_, self.structure_.parameter_names
+        known = self.identifiability_.rank == len(theta)
+        if not known or self.fit_error_ > _POOR_FIT or not isinstance(self.init, str):
+            return
+        other = as_good(problem, theta, self.fit_error_)
+        if other is None:
+            return
+        apart = np.flatnonzero(are_apart(other, theta))
+        gains = [self.identifiability_.sensitivities[names[j]] for j in apart]
+        moved = np.array(gains) * max(self.fit_error_, EXACT_FIT) * np.abs(theta[apart])
+        if not (np.abs(other - theta)[apart] > moved).all():
+            return  # errors of the response may lead as far
+        values = listed([f"{names[j]} = {other[j]:.4g}" for j in apart], _NAMED)
+        warn(
+            f"other values of {listed([repr(names[j]) for j in apart], _NAMED)} give "
+            f"the same response, {values}: the data do not tell which are right, nor "
+            "do `confidence_intervals`, which are about `params_` alone. Say it by "
+            "structure.with_bounds(), structure.with_ranges(), or a first guess, "
+            "`init`.",
+            kind=INTERCHANGE,
+        )
 
     def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
         """Where `params_covariance_` is that of a linear model, and it is none."""

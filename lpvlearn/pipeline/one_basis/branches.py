@@ -15,9 +15,8 @@ ones of every length kept; their evidences also tell how certain the choice is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +25,13 @@ from scipy.spatial.distance import cdist
 
 from ...lpv.alignment import spanning_tree
 from ...models.scheduling_range import in_range_of_points
+from ...restructuring.equal_optima import (
+    EQUAL,
+    EXACT,
+    elsewhere,
+    exchanges,
+    is_other,
+)
 from ...restructuring.problem import RestructuringProblem
 from ...restructuring.uncertainty import ParameterUncertainty
 from ...structures.interchanges import (
@@ -35,20 +41,15 @@ from ...structures.interchanges import (
     slow_first,
     within_bounds,
 )
-from ...structures.structure import GrayBoxStructure, drawn_around
+from ...structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
 Choices = NDArray[np.intp]
 Distance = Callable[[Array], Array]  # of families (..., n_points, n_params)
 
-# A fit is another optimum where its error exceeds that of the point's own by no more
-# than a part, or rounding, and a parameter differs by more than a part (those below
-# _TINY of the largest by that of it).
-_EQUAL, _EXACT, _OTHER, _TINY = 1.02, 1e-9, 1e-2, 1e-6
 _OPTIMA = 6  # of a point at most, apart from interchanges
-_FEW = 8  # parameters of which any two may be exchanged
+_TINY = 1e-6  # part of the mean square below which what is usual says nothing
 _SWEEPS = 4  # over the points: optima travel that far
-_SCATTERED, _SPREAD = 12, 1.0  # starts about an optimum, by factors of e or so
 
 # Prior of a parameter over the scheduling range, in units of its spread: the level, the
 # change of its line, and what bends: its sizes, its lengths, and noise beside the known
@@ -182,7 +183,7 @@ def _equal_optima(
     if any(f.identifiability_.rank < f.structure_.n_params for f in fitted):
         return optima, lower  # whole valleys of them
     starts = [own.start_params_ for own in fitted]
-    least = [max(own.fit_error_, _EXACT) for own in fitted]
+    least = [max(own.fit_error_, EXACT) for own in fitted]
     known = [[x[places]] for x in starts]
     order, parents = spanning_tree(kappa, outward=False)
     edges = [(int(k), int(parents[k])) for k in order[1:]]
@@ -190,11 +191,11 @@ def _equal_optima(
     beside = [[j for i, j in edges if i == k] for k in range(len(kappa))]
     waiting = [(i, starts[j]) for i, j in edges]
     root = int(order[0])
-    most = _EQUAL * least[root]
+    most = EQUAL * least[root]
     if len(places) == 1:
-        for pi in _exchanges(problems[root], starts[root], most):
+        for pi in exchanges(problems[root], starts[root], most):
             waiting += [(k, start[pi]) for k, start in enumerate(starts)]
-    for other in _elsewhere(problems[root], starts[root], most, places):
+    for other in elsewhere(problems[root], starts[root], most, places):
         waiting += [(k, other) for k in range(len(starts))]
     for _ in range(_SWEEPS):
         new = []
@@ -202,78 +203,19 @@ def _equal_optima(
             fit = problems[i].fit(start)
             if fit is None or len(optima[i]) == _OPTIMA:
                 continue
-            if fit.relative_error > _EQUAL * least[i]:
+            if fit.relative_error > EQUAL * least[i]:
                 continue
-            if _EQUAL * fit.relative_error < least[i] > _EXACT:
-                least[i], lower[i] = max(fit.relative_error, _EXACT), True
+            if EQUAL * fit.relative_error < least[i] > EXACT:
+                least[i], lower[i] = max(fit.relative_error, EXACT), True
                 optima[i], known[i] = [fit.x], [fit.x[places]]
                 new += [(k, fit.x) for k in beside[i]]
                 continue
-            if _is_other(fit.x, np.vstack(known[i])):
+            if is_other(fit.x, np.vstack(known[i])):
                 optima[i].append(fit.x)
                 known[i].append(fit.x[places])
                 new += [(k, fit.x) for k in beside[i]]
         waiting = new
     return optima, lower
-
-
-def _is_other(theta: Array, known: Array) -> bool:
-    """Whether parameters are none of the rows that are known."""
-    size = np.maximum(np.abs(theta), _TINY * np.abs(theta).max())
-    gaps = np.abs(known - theta) / np.where(size > 0, size, 1.0)
-    return bool((gaps.max(1) > _OTHER).all())
-
-
-def _exchanges(
-    problem: RestructuringProblem, theta: Array, most: float
-) -> list[list[int]]:
-    """Which two parameters, exchanged, lead to other optima of at most that error.
-
-    Of parts of like kind, lags in series, say, another value of each gives the same
-    response. Of many parameters that is not looked for.
-    """
-    n = len(theta)
-    exchanged = [
-        [{i: j, j: i}.get(k, k) for k in range(n)]
-        for i, j in combinations(range(n if n <= _FEW else 0), 2)
-    ]
-    itself = np.arange(n)[None]
-    starts = [theta[pi] for pi in exchanged]
-    return [exchanged[k] for k, _ in _others(problem, theta, starts, most, itself)]
-
-
-def _elsewhere(
-    problem: RestructuringProblem, theta: Array, most: float, places: Choices
-) -> list[Array]:
-    """Other optima of at most that error, from starts about the one that is known.
-
-    As where a lag may have any of several poles, and the rest of a model follows.
-    """
-    starts = drawn_around(theta, _SCATTERED, np.random.default_rng(0), _SPREAD)
-    starts = np.clip(starts, problem.structure.lower, problem.structure.upper)
-    return [other for _, other in _others(problem, theta, starts, most, places)]
-
-
-def _others(
-    problem: RestructuringProblem,
-    theta: Array,
-    starts: Iterable[Array],
-    most: float,
-    places: Choices,
-) -> list[tuple[int, Array]]:
-    """Numbers of the starts that lead to other optima of at most that error, and these.
-
-    Other than theta and than one another, apart from permutations `places`.
-    """
-    known, found = theta[places], []
-    for k, start in enumerate(starts):
-        fit = problem.fit(start)
-        if fit is None or fit.relative_error > most:
-            continue
-        if _is_other(fit.x, known):
-            known = np.vstack([known, fit.x[places]])
-            found.append((k, fit.x))
-    return found
 
 
 def _numbering(
