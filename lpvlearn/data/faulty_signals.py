@@ -28,6 +28,16 @@ _STAYS, _LONGER, _OTHERS, _CHANGES = 10, 3, 0.1, 0.5
 # than this share of its samples. Not if so many of the jumps are moves of the inputs.
 _APART, _MOST, _BACK, _SELDOM, _FOLLOWED = 4.0, 0.95, 0.5, 0.1, 0.7
 
+# A value stands apart that is farther from all others than so many times their range,
+# of which there are so many; one that loggers write, below others that are positive, if
+# it is that part of the range away. In less than `_SELDOM` of the samples, or, of
+# one that loggers write, in less than half.
+_RANGES, _VALUES, _BELOW = 3.0, 10, 0.1
+
+# What loggers write where nothing was measured: nines, limits of integers, and others
+_CODES = {32767.0, 32768.0, 65535.0, 2147483647.0, 2147483648.0, 7777.0, 8888.0}
+_HUGE_CODE, _NINES = 1e19, 2  # no measured value; digits, at least
+
 # A sample stands out that is this many times as far from the median as this share of
 # others are, of so many at least.
 _FAR, _USUAL, _FAR_OF = 5.0, 0.95, 50
@@ -66,6 +76,37 @@ def far_out(signals: Array) -> NDArray[np.bool_]:
     at = (np.abs(signals - middle) > _FAR * usual) & (usual > 0.0)
     far[1:-1] = at[1:-1] & ~at[:-2] & ~at[2:]
     return far
+
+
+def stands_apart(signal: Array) -> float | None:
+    """A seldom value of a signal (n_samples,) that is far from all others; else None.
+
+    >>> stands_apart(np.append(np.arange(99.0), -9999.0))
+    -9999.0
+    """
+    for value in (signal.min(), signal.max()):
+        others = signal[signal != value]
+        known = is_code(value)
+        if len(others) <= (0.5 if known else 1.0 - _SELDOM) * len(signal):
+            continue
+        low, width = others.min(), np.ptp(others)
+        gap = max(low - value, value - others.max())
+        far = gap > _RANGES * width
+        far |= known and value < 0.0 <= low and gap > _BELOW * width
+        if far and len(np.unique(others)) > _VALUES:
+            return float(value)
+    return None
+
+
+def is_code(value: float) -> bool:
+    """Whether loggers write a number where nothing was measured.
+
+    >>> [is_code(x) for x in (-9999.0, 99.9, 32767.0, 1e20, 9.0, 1000.0)]
+    [True, True, True, True, False, False]
+    """
+    digits = f"{abs(value):.10g}".replace(".", "")
+    nines = len(digits) >= _NINES and set(digits) == {"9"}
+    return nines or abs(value) in _CODES or abs(value) > _HUGE_CODE
 
 
 def held_for(signals: Sequence[Array]) -> int:

@@ -68,6 +68,12 @@ _UNITS_SINCE_1970 = (
     ("ns", "nanoseconds", np.inf),
 )
 
+# Numbers whose digits are those of a date, by how many they are; years that are meant,
+# and how many numbers are looked at, of so many at least.
+_WRITTEN = {8: "%Y%m%d", 10: "%Y%m%d%H", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
+_YEARS = 1900, 2100
+_FEWEST, _LOOKED_AT = 3, 1000
+
 # Share of the steps up to which a table does not look shuffled: those that go back in
 # time, where experiments follow each other, or leave rows out, as a logger does.
 _FEW = 0.05
@@ -125,6 +131,14 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     finite = np.abs(seconds) < _LATEST
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
+    written = _format_of_dates(seconds)
+    if written is not None:
+        raise ValueError(
+            f"Time column {column!r} must hold seconds or dates. Got numbers like "
+            f"{seconds[0]:.0f}, whose digits are those of a date. Give dates: "
+            f"pandas.to_datetime(X[{column!r}].astype('int64').astype(str), "
+            f"format={written!r}); or subtract the first, if they are seconds."
+        )
     if len(seconds) and seconds.min() > _SINCE_1970:
         unit, name = next(
             (unit, name)
@@ -137,6 +151,19 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
             f"pandas.to_datetime(X[{column!r}], unit={unit!r})."
         )
     return seconds
+
+
+def _format_of_dates(numbers: NDArray[np.floating]) -> str | None:
+    """The format of dates, where numbers are written like that: 20240131."""
+    if len(numbers) < _FEWEST or not numbers.min() > 10.0**7:
+        return None
+    written = _WRITTEN.get(len(f"{numbers.min():.0f}"))
+    some = numbers[:: max(len(numbers) // _LOOKED_AT, 1)]
+    if written is None or (some != np.rint(some)).any():
+        return None
+    texts = pd.Series(some).map("{:.0f}".format)
+    years = pd.to_datetime(texts, format=written, errors="coerce").dt.year
+    return written if years.between(*_YEARS).all() else None
 
 
 class Clock(NamedTuple):

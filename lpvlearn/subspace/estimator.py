@@ -33,7 +33,7 @@ from ..systems.threads import one_blas_thread
 from ..validation import frequencies, naming_argument, one_of, shown
 from .completion import completed, completed_by
 from .diagnosis.cross_checks import tell_of_delay
-from .diagnosis.fit_warnings import TESTS, warn_about, warn_about_pole
+from .diagnosis.fit_warnings import TESTS, warn_about, warn_beside_faults
 from .diagnosis.horizons import warn_about_horizon
 from .evidence.offsets import Offsets, of_rates
 from .evidence.residuals import (
@@ -698,7 +698,7 @@ class SubspaceLTI(ScoredFromRest):
         if telling.silent:
             return fitted
         if telling.spoilt:
-            warn_about_pole(fitted.model.A, telling, fitted)
+            warn_beside_faults(fitted, telling)
             return fitted
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):

@@ -30,6 +30,7 @@ from .alternatives.trends import with_trends
 from .closed_loop.answers import tell_of_answering_input
 from .diagnosis.cross_checks import tell_of_contradiction, tell_of_input_spikes
 from .diagnosis.faulty_outputs import (
+    tell_of_codes,
     tell_of_drift,
     tell_of_dropouts,
     tell_of_exchange,
@@ -65,6 +66,7 @@ def fit_samples(
     outputs = [y for _, y in pairs]
     if not telling.silent:
         tell_of_still_outputs(outputs, telling)
+        tell_of_codes(pairs, telling)
         tell_of_dropouts(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     samples = samples._replace(pairs=pairs)

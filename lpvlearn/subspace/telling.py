@@ -14,7 +14,7 @@ from ..exceptions import warn
 
 # Kinds of warnings of samples that are none of the system's: what else may be told of a
 # model that was made of them comes of that.
-SPOILING = frozenset({"dropouts", "lines", "bursts", "wraps", "exchanged"})
+SPOILING = frozenset({"codes", "dropouts", "lines", "bursts", "wraps", "exchanged"})
 
 _UNHEARD: ContextVar[bool] = ContextVar("unheard", default=False)
 

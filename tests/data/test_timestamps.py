@@ -206,3 +206,17 @@ def test_parts_of_seconds_since_1970_are_told(unit, parts):
 def test_what_is_no_time_is_told_its_own_remedy(stamps, remedy):
     with pytest.raises(ValueError, match=f"^Time column 't' must hold.*{remedy}"):
         time_in_seconds(stamps, "t")
+
+
+@pytest.mark.parametrize("times", ["", "%H", "%H%M", "%H%M%S"])
+def test_dates_that_are_written_as_numbers_are_refused_with_their_format(times):
+    written = f"%Y%m%d{times}"
+    stamps = pd.date_range("2012-12-30", periods=40, freq="D").strftime(written)
+    with pytest.raises(ValueError, match=rf"digits are those of a date.*{written!r}"):
+        time_in_seconds(stamps.astype("int64"), "day")
+    with pytest.raises(ValueError, match="digits are those of a date"):
+        time_in_seconds(stamps.astype(float), "day")
+
+
+def test_seconds_that_begin_like_a_date_go_on_like_none():
+    time_in_seconds(20121230 + 10.0 * np.arange(100), "t")

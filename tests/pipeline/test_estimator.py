@@ -941,7 +941,7 @@ def test_what_spoils_a_record_is_told_alone(spoilt):
     X, y = spring_tables(noise=0.01, n_samples=400)
     if spoilt == "by a sensor":
         y = y.mask(np.random.default_rng(0).random(y.shape) < 0.005, -9999.0)
-        cause = "falls to -9999"
+        cause = "is -9999 in"
     else:
         X = X.drop(columns="time").sample(frac=1, random_state=0)
         y, cause = y.loc[X.index], "not in the order of its index"

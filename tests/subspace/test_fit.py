@@ -449,7 +449,7 @@ def test_a_sensor_that_hangs_is_told():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fallen, length", [(0.0, 3), (-999.0, 1)])
+@pytest.mark.parametrize("fallen, length", [(0.0, 3), (-5.0, 1), (-999.0, 1)])
 def test_a_sensor_that_drops_out_is_told(fallen, length):
     rng = np.random.default_rng(0)
     u = np.repeat(rng.choice([-1.0, 1.0], (100, 1)), 6, axis=0)
@@ -461,6 +461,8 @@ def test_a_sensor_that_drops_out_is_told(fallen, length):
         y[part] = fallen
     n = 4 * length
     told = rf"'level' falls to {fallen:.6g} in {n} sample\(s\), 4 time.*sample 77,"
+    if fallen == -999.0:
+        told = "Output 'level' is -999 in 4 sample.*nothing was measured.* sample 77,"
     named = pd.Series(y[:, 0], name="level")
     with pytest.warns(UserWarning, match=told) as warned:
         SubspaceLTI().fit(pd.DataFrame(u, columns=["pump"]), named)
@@ -469,6 +471,36 @@ def test_a_sensor_that_drops_out_is_told(fallen, length):
         y[part] = np.nan
     model = SubspaceLTI(missing="estimate").fit(u, y)
     assert abs(model.lti_.poles() - 0.9).max() < 0.01
+
+
+def test_what_a_logger_writes_where_nothing_was_measured_is_told():
+    """Once, and alone: what it makes of the model is no other fault."""
+    rng = np.random.default_rng(0)
+    u = 20.0 + 5.0 * rng.standard_normal((1000, 1))
+    y = lfilter([0.0, 0.02], [1.0, -0.9], u - 20.0, axis=0)
+    y += 0.05 * rng.standard_normal(y.shape)
+
+    def told(rows, value, *tables):
+        X, measured = pd.DataFrame(u, columns=["flow"]), pd.Series(y[:, 0], name="T")
+        if "flow" in tables:
+            X.loc[rows, "flow"] = value
+        if "T" in tables:
+            measured.loc[rows] = value
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            SubspaceLTI(1).fit(X, measured)
+        return [str(one.message) for one in warned]
+
+    assert told([], 0.0) == []
+    (message,) = told([500], -9999.0, "flow", "T")
+    assert "Input 'flow' is -9999 in 1 sample(s), as other channels" in message
+    (message,) = told([200, 201, 500], -9999.0, "flow")
+    assert "Input 'flow' is -9999 in 3 sample(s), far from" in message
+    assert "sample 200" in message and "missing='split'" in message
+    (message,) = told([77], 32767.0, "T")
+    assert "Output 'T' is 32767 in 1 sample(s)" in message
+    (message,) = told([77, 80], -4000.0, "flow", "T")  # no code, but in both
+    assert "other channels" in message
 
 
 @pytest.mark.parametrize("size", [20.0, 1e3])

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from ...data.faulty_signals import (
     drops_out,
     held_for,
+    is_code,
     line_length,
     repeated_in_bursts,
+    stands_apart,
     stays_put,
     wraps,
 )
@@ -71,10 +73,49 @@ def tell_of_held_outputs(outputs: Sequence[Array], telling: Telling) -> None:
         )
 
 
+def tell_of_codes(pairs: Pairs, telling: Telling) -> None:
+    """Tell of values that loggers write where nothing was measured.
+
+    They are far from all others. So is what several channels do in the same samples,
+    inputs and outputs alike, whatever the value.
+    """
+    if "codes" in telling:
+        return
+    names = (telling.input, telling.output)
+    called = ("Input", "Output")
+    found = []
+    for k, side in enumerate(zip(*pairs, strict=True)):
+        signals = np.concatenate(side)
+        for i, signal in enumerate(signals.T):
+            known = np.isfinite(signal)
+            value = stands_apart(signal[known]) if known.any() else None
+            if value is not None:
+                found.append((k, i, value, signal == value))
+    for k, i, value, there in found:
+        alike = any(other != k and (at == there).all() for other, _, _, at in found)
+        if not (alike or is_code(value)):
+            continue
+        lengths = [len(u) for u, _ in pairs]
+        first, starts = int(there.argmax()), np.cumsum([0, *lengths])
+        e = int(np.searchsorted(starts, first, side="right")) - 1
+        where = in_experiment(first - starts[e], e, len(pairs))
+        telling.once(
+            "codes",
+            f"{called[k]} {names[k](i)} is {value:.6g} in {np.count_nonzero(there)} "
+            f"sample(s){', as other channels are far out there' * alike}, far from "
+            "all its other values, as loggers write where nothing was measured; the "
+            f"first is sample {where}, counted from 0. Put NaN in place of these "
+            "samples and use missing='split', or 'estimate' where they are outputs.",
+        )
+        return
+
+
 def tell_of_dropouts(pairs: Pairs, telling: Telling) -> None:
     """Tell of outputs whose sensor reads one value in between."""
     inputs, outputs = zip(*pairs, strict=True)
-    for k in range(outputs[0].shape[1]) if "dropouts" not in telling else ():
+    if telling.kinds & {"codes", "dropouts"}:
+        return
+    for k in range(outputs[0].shape[1]):
         found = drops_out([y[:, k] for y in outputs], inputs)
         if found is not None:
             n = sum(stop - start for _, start, stop in found.runs)
@@ -150,7 +191,9 @@ def tell_of_exchange(pairs: Pairs, fitted: LocalFit, telling: Telling) -> None:
             "exchanged",
             f"Output {names[0]} takes {most} values only, as a command does, and "
             f"input {names[1]} takes {n_inputs[0]}: inputs and outputs seem to be "
-            "exchanged. Give what moves the system as `X`, and what answers as `y`.",
+            "exchanged. Give what moves the system as `X`, and what answers as `y`. "
+            "Where the output is a switch or counts events, a linear model tells its "
+            "mean alone.",
         )
 
 

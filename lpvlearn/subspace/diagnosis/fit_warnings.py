@@ -31,7 +31,7 @@ from ..orders.identification import Settings
 from ..orders.selection import MAX_ORDER
 from ..samples.records import thinned
 from ..simulation_error.held_out import HeldOut
-from ..telling import Telling, in_experiment
+from ..telling import SPOILING, Telling, in_experiment
 
 Array = NDArray[np.float64]
 
@@ -85,6 +85,16 @@ _POOR = 0.2  # of the outputs' size
 
 # What was poor from the start was told then; it is told again where it grows by this.
 _GROWN = 1.1
+
+
+def warn_beside_faults(fitted: LocalFit, telling: Telling) -> None:
+    """Tell what is wrong with a model of samples that are not all of the system's.
+
+    That it explains next to nothing a few repeated samples are no reason for.
+    """
+    warn_about_pole(fitted.model.A, telling, fitted)
+    if fitted.residual > USELESS and not telling.kinds & (SPOILING - {"bursts"}):
+        _warn_of_error(fitted, True, telling, False)
 
 
 def warn_about(fitted: LocalFit, telling: Telling) -> None:
@@ -225,8 +235,8 @@ def _warn_of_error(
             f"they move. Try offset='constant'{higher} or a longer `horizon`, and "
             "check that inputs and outputs belong together and in the order of time.",
         )
-    elif chose_order and len(fitted.model.A) and not whitening.of_differences:
-        _warn_of_outputs(fitted, telling)
+    elif len(fitted.model.A):
+        _warn_of_outputs(fitted, chose_order, telling)
 
 
 def _next_to_nothing(fitted: LocalFit) -> str:
@@ -264,17 +274,30 @@ def _confirms_means_alone(fitted: LocalFit) -> bool:
     return stays_far(evidence.records)
 
 
-def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
-    """Tell of outputs that a model of several does not explain."""
+def _warn_of_outputs(fitted: LocalFit, chose_order: bool, telling: Telling) -> None:
+    """Tell of outputs whose motion a model does not explain, of all of them or some."""
     model, left = fitted.evidence.model, _motions_left(fitted)
-    if len(model.C) == 1 or left is None:
+    if left is None:
         return
     poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
+    if poor and len(poor) == np.count_nonzero(~np.isnan(left)):
+        if fitted.method == "pbsid" or fitted.grows():
+            return  # what it simulates without a controller tells nothing
+        telling.once(
+            "useless",
+            "The model explains next to nothing of how the outputs move: its "
+            f"simulation error is {100.0 * np.sqrt(np.nanmean(left)):.0f} % of that. "
+            "Try a longer `horizon`, or another `order`, and check that inputs and "
+            "outputs belong together and in the order of time.",
+        )
+        return
+    if not chose_order:
+        return
     about_one = np.abs(np.linalg.eigvals(model.A) - 1.0) < _ABOUT_ONE
     remedy = "Try"
     if about_one.any():
         remedy = "Where it integrates, name it in `integrating`. Else try"
-    if poor and len(poor) < np.count_nonzero(~np.isnan(left)):
+    if poor:
         telling.once(
             "noisy output",
             f"The model explains next to nothing of output(s) {', '.join(poor)}: what "
