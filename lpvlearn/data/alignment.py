@@ -51,7 +51,8 @@ def align_outputs(
         if same:
             warn(
                 f"`{second}` has the row labels of {first} in another order: its rows "
-                f"are put into the order of {first}, by label. Give {positions}."
+                f"are put into the order of {first}, by label. Give {positions}, as "
+                "where they were shuffled on purpose (permutation_test_score)."
             )
             return y.loc[own]
         # Numbers of rows say nothing, nor do labels of another kind.

@@ -95,7 +95,10 @@ def resample(
     grid m times as fine. All its signals pass the same filter without delay, a
     raised-cosine window (Hann) over two steps of the coarse grid, and every m-th sample
     is kept. What a linear system makes of a filtered input is the filtered output: the
-    model stays the same, while what the coarse grid cannot show is 30 dB down.
+    model stays the same. Above the sampling frequency of the coarse grid everything is
+    30 dB down; from half of it on, by 6 dB and more, what is left folds back, in inputs
+    and outputs alike. Longer filters, steeper there, give no better models, and lose
+    more beside gaps.
 
     Interpolation smooths noise, and noise that was white is so no longer: resample
     where `time_tol` does not do, not always.

@@ -1058,7 +1058,8 @@ class SubspaceLTI(ScoredFromRest):
         -----
         UserWarning
             If the constants of the experiments of `fit` differ: the outputs are about
-            their mean.
+            their mean. If inputs move about another level than `input_offset_`, the
+            mean of those of `fit`, at which the simulation begins.
         """
         check_is_fitted(self, "lti_")
         if self.offsets_differ_:
@@ -1068,7 +1069,19 @@ class SubspaceLTI(ScoredFromRest):
                 "are known, predict_with_initial_state(X, y) and "
                 "initial_state='estimate' of scores estimate those of every experiment."
             )
-        return self._in_table(self._read(X, None), X, self._simulator().simulated)
+        experiments, simulator = self._read(X, None), self._simulator()
+        away = next((e for e in experiments if simulator.begins_away_from(e)), None)
+        if away is not None:
+            u0 = simulator.resting_point()[0]
+            levels = ", ".join(f"{u:.4g}" for u in away.inputs.mean(axis=0))
+            warn(
+                f"Inputs of experiment {away.label!r} stay about {levels}, and the "
+                "simulation begins at rest where those of `fit` were in the mean, "
+                f"{', '.join(f'{u:.4g}' for u in u0)} (`input_offset_`): at first it "
+                "moves from there. Where outputs are known, use "
+                "predict_with_initial_state(X, y)."
+            )
+        return self._in_table(experiments, X, simulator.simulated)
 
     @one_blas_thread
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:

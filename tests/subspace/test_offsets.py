@@ -730,6 +730,26 @@ def test_drift_does_not_hide_constants_far_from_zero(seed):
     assert bft_score(plant.simulate(fresh), model.lti_.simulate(fresh)) > 93.0
 
 
+def test_prediction_warns_where_inputs_stay_about_another_level(rng):
+    plant = StateSpace([[-0.05]], [[0.15]], [[1.0]])
+    u = np.repeat(rng.choice([-1.0, 1.0], (200, 1)), 8, axis=0)
+    u[800:] += 5.0
+    halves = [plant.simulate(half, sampling_time=0.5) for half in np.split(u, 2)]
+    halves[1] = 15.0 + plant.simulate(u[800:] - 5.0, sampling_time=0.5)
+    y = 20.0 + np.vstack(halves) + 0.02 * rng.standard_normal((1600, 1))
+    run = np.repeat([0.0, 1.0], 800)
+    model = SubspaceLTI(1, experiment=1, sampling_time=0.5)
+    model.fit(np.column_stack([u, run]), y)
+    told = r"experiment 0.0 stay about .* begins at rest .*\(`input_offset_`\)"
+    X = np.column_stack([u[:800], run[:800]])
+    with pytest.warns(UserWarning, match=told):
+        outputs = model.predict(X)
+    assert abs(outputs[0, 0] - 27.5) < 1.0  # between 20 and 35
+    assert bft_score(y[:800], model.predict_with_initial_state(X, y[:800])) > 98.0
+    X[:, 0] += 2.5
+    model.predict(X)
+
+
 def test_prediction_warns_where_constants_differ(rng):
     X, y = table(rng, noise=0.1)
     model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)

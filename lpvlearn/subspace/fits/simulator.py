@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 
 _FAINT = 1e-3  # weight of an estimate beside an output that is known
 
+_AWAY = 0.5  # of the range of an input, from where it begins to that
+
 _GROWS = np.log(1e8)  # over an experiment: no simulation tells levels then
 
 
@@ -182,6 +184,15 @@ class Simulator(NamedTuple):
         first = first_inputs(u) - self.resting_point()[0]
         x0 = held_state(lti.A, lti.B, first, discrete=True)
         return None if x0 is None else np.append(x0, np.repeat(first, lti.input_delay))
+
+    def begins_away_from(self, experiment: Experiment) -> bool:
+        """Whether inputs move about a level that they begin at rest far from."""
+        u = experiment.inputs
+        if not (self.evidence.free.n_trend and self.beginning(experiment) is None):
+            return False
+        u0, low, high = self.resting_point()[0], u.min(axis=0), u.max(axis=0)
+        gap = np.maximum(low - u0, u0 - high)
+        return bool(((low < high) & (gap > _AWAY * (high - low))).any())
 
     def own_part(
         self,
