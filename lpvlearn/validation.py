@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
+from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -381,6 +382,17 @@ def names_of(
             f"`{argument}` must be a list of {many}distinct names. Got {shown(names)}."
         )
     return listed
+
+
+def optional_module(name: str, asked_by: str, package: str) -> Any:
+    """A module of a package that only some need, or an ImportError that says which."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"`{asked_by}` needs the package {package}. Install it: pip install "
+            f"{package}."
+        ) from error
 
 
 def units_by_name(units: Any) -> dict[str, str] | None:

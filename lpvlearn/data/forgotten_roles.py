@@ -125,7 +125,8 @@ def warn_of_disorder(
 ) -> None:
     """Warn of rows not in the order of their numbers or dates, the index, or torn.
 
-    Labels that stand twice (tables below each other) tell nothing. Numbers that mostly
+    An index that begins anew, where nobody named experiments, is that of tables below
+    each other. Labels that stand twice else tell nothing. Numbers that mostly
     go on by the same step, and elsewhere by some of them, tell that rows are missing
     there, unless the labels in between are those of other experiments. Dates tell the
     step, too, which the `sampling_time` (seconds) is to be.
@@ -142,6 +143,8 @@ def warn_of_disorder(
                 return
         steps = np.diff(numbers[rows])
         if len(steps) < _FEWEST or not (steps > 0.0).all():
+            if len(groups) == 1 and _begins_anew(numbers):
+                _tell_of_several(labels, numbers)
             continue
         step = float(np.median(steps[steps < 1.5 * steps.min()]))
         torn = np.flatnonzero(steps > 1.5 * step)
@@ -185,6 +188,29 @@ def _tell_of_order(labels: pd.Index) -> None:
         "them (sort_index of pandas) and split by experiment with "
         "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
         "means nothing, drop it (reset_index).",
+        kind=DISORDER,
+    )
+
+
+def _begins_anew(numbers: Array) -> bool:
+    """Whether an index goes on evenly, and now and then from its beginning."""
+    steps = np.diff(numbers)
+    back = steps < 0.0
+    even = steps[~back]
+    if not back.any() or back.sum() > _RESTARTS * len(steps) or not len(even):
+        return False
+    off = np.concatenate([even - even[0], numbers[1:][back] - numbers[0]])
+    return bool(even[0] > 0.0 and (np.abs(off) < _OFF * even[0]).all())
+
+
+def _tell_of_several(labels: pd.Index, numbers: Array) -> None:
+    where = int(np.argmax(np.diff(numbers) < 0.0)) + 1
+    warn(
+        f"The index of X begins anew at row {where}, at {labels[where]}, as where "
+        "tables stand below each other. To a model one record goes on there. Name the "
+        "column, or the level of the index, that tells them apart: `experiment` "
+        "(pandas.concat with `keys` and `names` makes one); if the index means "
+        "nothing, drop it (reset_index).",
         kind=DISORDER,
     )
 

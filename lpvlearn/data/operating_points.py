@@ -114,6 +114,7 @@ def local_experiments(
             )
         return OperatingPoints(np.zeros((1, 1)), groups, np.zeros(1))
     _check_local(experiments, kappa)
+    _tell_of_mixed(groups, kappa)
     moved = np.max([np.ptp(run.kappa, axis=0) for run in experiments], axis=0)
     if len(kappa) == 1:
         place = ", ".join(
@@ -126,6 +127,31 @@ def local_experiments(
             "follows the scheduling variable, or leave `scheduling` out."
         )
     return OperatingPoints(kappa, groups, moved)
+
+
+def _tell_of_mixed(groups: Sequence[Sequence[Experiment]], kappa: Array) -> None:
+    """Warn of labels of operating points that scheduling variables contradict."""
+    if any(run.operating_point is None for group in groups for run in group):
+        return
+    means = [np.array([mean_values(run.kappa) for run in group]) for group in groups]
+    every = np.vstack(means)
+    unit = np.ptp(every, axis=0) if len(kappa) > 1 else np.abs(every).max(axis=0)
+    unit[unit == 0.0] = 1.0
+    for k, (group, own) in enumerate(zip(groups, means, strict=True)):
+        extent = (np.ptp(own, axis=0) / unit).max()
+        still = max((np.ptp(run.kappa, axis=0) / unit).max() for run in group)
+        others = np.abs(np.delete(kappa, k, axis=0) - kappa[k]) / unit
+        nearest = others.max(axis=1).min() if len(others) else 2.0 * _CLOSE
+        if extent > max(0.5 * nearest, _CHAIN * still):
+            ends = zip(own.min(axis=0), own.max(axis=0), strict=True)
+            places = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in ends)
+            warn(
+                f"The experiments of operating point {group[0].operating_point!r} are "
+                f"at scheduling {places}, as far apart as points are: one model cannot "
+                "be right at all of them. Check the labels of `operating_point`, or "
+                "leave them out: `scheduling` tells the points."
+            )
+            return
 
 
 def without_spikes(experiments: Sequence[Experiment]) -> list[Experiment]:

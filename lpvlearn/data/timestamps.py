@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
-from datetime import date
+from datetime import date, time
 from numbers import Complex, Real
 from typing import Any, NamedTuple, NoReturn
 
@@ -431,6 +431,8 @@ def _remedy(value: Any) -> str:
         return "Convert periods with their to_timestamp()."
     if isinstance(value, date) and value is not pd.NaT:
         return "Convert dates with pandas.to_datetime."
+    if isinstance(value, time):
+        return "Convert times of day with pandas.to_timedelta(column.astype(str))."
     if isinstance(value, Complex) and not isinstance(value, Real):
         return "Give seconds as real numbers."
     return (

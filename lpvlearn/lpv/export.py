@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..models.statespace import StateSpace
 from ..systems.whole_files import whole_file
-from ..validation import file_name
+from ..validation import file_name, optional_module
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
 
 def as_dataset(grid: Grid) -> Any:
     """The models as an `xarray.Dataset`, see `LPVStateSpace.to_xarray`."""
-    from xarray import Dataset
+    Dataset = optional_module("xarray", "to_xarray", "xarray").Dataset
 
     names = [str(name) for name in grid.scheduling]
     order, shape = _rectangular(grid.points)

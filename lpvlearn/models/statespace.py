@@ -43,6 +43,7 @@ from ..validation import (
     measured_samples,
     names_of,
     one_of,
+    optional_module,
     positive_time,
     squarable,
     state_vector,
@@ -716,14 +717,42 @@ class StateSpace(VersionedPickle):
                 "continuous time after to_discrete(sampling_time)), or leave it out by "
                 "with_input_delay(0)."
             )
-        import control
-
+        control = optional_module("control", "to_control", "control")
         for key in ("inputs", "outputs"):
             own = getattr(self, f"{key[:-1]}_names")
             if own is not None:
                 names.setdefault(key, [str(name).replace(".", "_") for name in own])
         dt = 0 if self.is_continuous else self.sampling_time
         return control.ss(self.A, self.B, self.C, self.D, dt, **names)
+
+    def to_scipy(self) -> Any:
+        """The model as a ``scipy.signal.StateSpace``, with or without ``dt``.
+
+        What that knows: ``step()`` and ``impulse()``, ``to_zpk()`` and ``to_tf()``.
+
+        Raises
+        ------
+        ValueError
+            If the model has a delay, which SciPy does not know.
+
+        Examples
+        --------
+        >>> lag = StateSpace(-2.0, 1.0, 6.0)
+        >>> time, response = lag.to_scipy().step(T=np.array([0.0, 10.0]))
+        >>> response.round(3)
+        array([0., 3.])
+        """
+        if self.input_delay.any():
+            raise ValueError(
+                "`to_scipy` needs a model without delay, which SciPy does not know. "
+                f"Got {self}. Make states of it by absorb_delay() (in continuous time "
+                "after to_discrete(sampling_time)), or leave it out by "
+                "with_input_delay(0)."
+            )
+        from scipy import signal
+
+        options = {} if self.is_continuous else {"dt": self.sampling_time}
+        return signal.StateSpace(self.A, self.B, self.C, self.D, **options)
 
     @classmethod
     def from_control(cls, model: Any) -> StateSpace:

@@ -1003,7 +1003,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         X : array-like of shape (n_freq,) or (n_freq, 1)
             Angular frequencies, rad/s.
         y : array-like of shape (n_freq, 2 * n_outputs * n_inputs)
-            The response there, as `predict` gives it.
+            The response there, as `predict` gives it; a complex array of shape (n_freq,
+            n_outputs, n_inputs) is accepted, as by `fit`.
         sample_weight : array-like of shape (n_freq,), default=None
             Weights of the frequencies.
 
@@ -1017,6 +1018,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         ValueError
             When a value is too large to be squared, or shapes do not fit.
         """
+        if np.iscomplexobj(y) and np.ndim(y) == 3:
+            y = stack_response(np.asarray(y))
         y = squarable("y", real_array("y", y))
         if y.size == 0:
             raise ValueError("`y` must hold a row for each frequency. Got none.")

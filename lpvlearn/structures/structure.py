@@ -274,7 +274,15 @@ class GrayBoxStructure(VersionedPickle):
         np.float64(2.4525)
         """
         start, names = named_values("initial", initial, parameter_names)
-        given = function(start) if callable(function) else function
+        try:
+            given = function(start) if callable(function) else function
+        except TypeError as error:
+            if "positional argument" not in str(error):
+                raise
+            raise ValueError(
+                "`function` must take one vector of all parameters, (n_params,). Got "
+                f"{error}. Take them apart within: k, c = theta."
+            ) from error
         if not isinstance(given, tuple | list) or len(given) not in (3, 4):
             many = f"{len(given)} of them" if isinstance(given, tuple | list) else ""
             raise ValueError(

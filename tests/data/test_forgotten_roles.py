@@ -151,7 +151,9 @@ def test_shuffled_rows_are_told_by_the_index(index):
     parts = [part for _, part in X.groupby("run")]
     assert warned(pd.concat(parts[::-1]), experiment="run") == []
     again = pd.concat([X.iloc[:N], X.iloc[:N]])
-    assert warned(again.drop(columns="run")) == []
+    assert warned(again.assign(run=np.repeat([0, 1], N)), experiment="run") == []
+    (message,) = warned(again.drop(columns="run"))
+    assert f"begins anew at row {N}" in message and "`experiment`" in message
     words = X.set_index(np.array([f"row {k % 7}, {k}" for k in range(len(X))]))
     assert warned(words, experiment="run") == []
 

@@ -1,6 +1,7 @@
 """Operating points: experiments grouped, and refused where they are not local."""
 
 import tracemalloc
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -257,3 +258,20 @@ def test_what_one_record_alone_has_is_no_noise_of_the_sensor(n, noise):
         noisy = [x + noise * rng.standard_normal(n) for x in values]
         runs = [_record(signal, k) for k, signal in enumerate(noisy)]
         assert moving_experiments(runs)[1] == [runs[-1]]
+
+
+@pytest.mark.parametrize(
+    "labels, told",
+    [
+        ("aaa", "operating point 'a' are at scheduling 0 to 2, as far apart"),
+        ("abb", "operating point 'b' are at scheduling 1 to 2, as far apart"),
+        ("abc", None),
+    ],
+)
+def test_labels_that_scheduling_variables_contradict_are_told(labels, told):
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        local_experiments(_runs([0.0, 1.0, 2.0], points=labels))
+        local_experiments(_runs([0.0, 0.01, 2.0], points="aab"))
+    said = [str(w.message) for w in warned if "Check the labels" in str(w.message)]
+    assert len(said) == (told is not None) and all(told in one for one in said)

@@ -1,7 +1,7 @@
 """Time stamps: even however they are stored, or refused."""
 
 import re
-from datetime import date
+from datetime import date, time
 
 import numpy as np
 import pandas as pd
@@ -201,6 +201,7 @@ def test_parts_of_seconds_since_1970_are_told(unit, parts):
         ([0.0, 1e308], r"1e\+308\)? at row 1. Drop rows without a time below"),
         ([0.0, pd.NaT], "no time at row 1. Drop rows without a time"),
         ([0.0, 1j], "Give seconds as real numbers"),
+        ([time(9), time(10)], r"pandas.to_timedelta\(column.astype\(str\)\)"),
     ],
 )
 def test_what_is_no_time_is_told_its_own_remedy(stamps, remedy):

@@ -336,6 +336,12 @@ def test_control_gets_zero_for_continuous_time(monkeypatch):
         assert back.sampling_time == model.sampling_time
 
 
+def test_a_package_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(ImportError, match=r"needs the package control. Install it"):
+        CONTINUOUS.to_control()
+
+
 def test_control_models_of_unknown_time_or_kind_are_refused():
     known = dict(A=ONE, B=ONE, C=ONE, D=ONE)
     with pytest.raises(ValueError, match="`model.dt`"):
@@ -633,3 +639,19 @@ def test_units_of_outputs_do_not_change_an_initial_state():
         y[:, 1] += 1e-9 * unit * rng.normal(size=50)
         found = model.estimate_initial_state(u, y)
         assert_allclose(found[1], x0[1], rtol=1e-6)
+
+
+def test_scipy_knows_the_same_model():
+    model = StateSpace([[0, 1], [-4.0, -0.8]], [[0], [1.0]], [[3.0, 1.0]], [[0.5]])
+    for one in (model, model.to_discrete(0.1)):
+        known = one.to_scipy()
+        assert known.dt == (None if one.is_continuous else 0.1)
+        np.testing.assert_allclose(
+            np.sort_complex(known.poles), np.sort_complex(one.poles()), rtol=1e-12
+        )
+        zpk = known.to_zpk()
+        s = 0.3j if one.is_continuous else np.exp(0.03j)
+        value = zpk.gain * np.prod(s - zpk.zeros) / np.prod(s - zpk.poles)
+        np.testing.assert_allclose(value, one.frequency_response([0.3])[0, 0, 0])
+    with pytest.raises(ValueError, match=r"needs a model without delay.*absorb_delay"):
+        model.with_input_delay(0.2).to_scipy()

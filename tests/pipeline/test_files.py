@@ -562,6 +562,11 @@ def test_a_folder_that_is_not_there_says_so(tmp_path):
         load(tmp_path / "none.zip")
 
 
+def test_names_of_other_programs_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"must not end in '.mat'.*to_mat\(\)"):
+        save(StateSpace(-1, 1, 1), tmp_path / "model.mat")
+
+
 def test_what_is_no_regular_file_stays_as_it_is(tmp_path):
     pipe, link = tmp_path / "pipe", tmp_path / "link"
     os.mkfifo(pipe)

@@ -227,3 +227,8 @@ def test_its_code_is_python_whatever_the_options(step):
     for name, option in step.get_params().items():
         as_lists = option.tolist() if isinstance(option, np.ndarray) else option
         assert str(again.get_params()[name]) == str(as_lists)
+
+
+def test_a_folder_that_is_not_there_is_told(fitted, spring, tmp_path):
+    with pytest.raises(FileNotFoundError, match="`path` .*page.html.*Make the folder"):
+        fitted.to_html_report(tmp_path / "none" / "page.html")

@@ -159,6 +159,7 @@ def wrong_jacobian(theta):
         ((pendulum, START), {"parameter_names": ["a", "b"]}, "`initial` must hold"),
         ((pendulum, START), {"parameter_names": ["a"] * 3}, "distinct names"),
         ((pendulum, {"a": 1.0}), {"parameter_names": ["b"]}, "`initial` must have a"),
+        ((lambda a, b, c: 0, START), {}, "`function` must take one vector of all"),
         ((lambda t: (1, 2), START), {}, r"`function` must return \(A, B, C\)"),
         ((lambda t: ([[1]], [[1]], [[1, 2]]), START), {}, "`B` needs 1 rows"),
         ((lambda t: ([[np.nan]], [[1]], [[1]]), START), {}, "`A` must be finite"),

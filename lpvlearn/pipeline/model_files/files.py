@@ -28,12 +28,13 @@ from sklearn.base import BaseEstimator
 from ...exceptions import PLAIN_DTYPES, version
 from ...systems.whole_files import whole_file
 from ...validation import file_name, shown
-from ..running.memory import unwritten
+from ..running.memory import writing
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
 
 SCHEMA = 1  # raised when a file of today could be misread by the code of tomorrow
 
 _TEXT = "model.json"
+_OF_OTHERS = {".mat", ".csv", ".json", ".npy", ".npz", ".pkl", ".h5"}
 
 # Beyond them a text is not one that `save` wrote: an LPV model of 1000 operating points
 # has 2 million characters in 100,000 values. They take 100 MB at most to read.
@@ -108,6 +109,12 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     array([-2.+0.j])
     """
     target = _file(path)
+    if target.suffix.lower() in _OF_OTHERS:
+        raise ValueError(
+            f"`path` must not end in {target.suffix!r}, as files of other programs "
+            f"do. Got {str(path)!r}. Use '.lpv', say; for MATLAB export an LPV model "
+            "by its to_mat()."
+        )
     writer = _Writer()
     if type(before_saving(model)) not in CLASSES.values():
         raise ValueError(
@@ -133,13 +140,8 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         raise ValueError(
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
-    try:
-        with whole_file(target) as file:
-            file.write(buffer.getbuffer())
-    except OSError as error:
-        told = type(error)(unwritten(f"`path` {str(path)!r}", error))
-        told.errno = error.errno
-        raise told from error
+    with writing(path), whole_file(target) as file:
+        file.write(buffer.getbuffer())
 
 
 def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:

@@ -16,6 +16,7 @@ import pickle
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -71,6 +72,17 @@ def unwritten(place: str, error: OSError, advice: str | None = None) -> str:
     else:
         advice = advice or "Take a place where you may write."
     return f"{place}: it cannot be written ({error.strerror or error}). {advice}"
+
+
+@contextmanager
+def writing(path: Any) -> Iterator[None]:
+    """Say of a `path` that cannot be written what to do."""
+    try:
+        yield
+    except OSError as error:
+        told = type(error)(unwritten(f"`path` {str(path)!r}", error))
+        told.errno = error.errno
+        raise told from error
 
 
 @dataclass(frozen=True)
