@@ -171,8 +171,8 @@ class PolynomialLPV(Interpolator):
             warn(
                 f"{n_points} operating points determine only {self.rank_} of the "
                 f"{len(self.powers_)} terms of degree {self.degree}: the polynomial of "
-                "minimum norm was taken. Lower `degree`, or add operating points that "
-                "are not on one curve.",
+                "minimum norm was taken. Add operating points that are not on one "
+                "curve, or give a lower `degree`.",
                 RankWarning,
             )
 

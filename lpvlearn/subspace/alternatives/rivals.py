@@ -311,15 +311,15 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
     the load that moves them be likelier beyond chance. Where outputs are several they
     must be no more than without, as further ones may be those of a noise that the
     outputs share; unless parts held out are simulated far better with these. Noise
-    that drifts makes some models likelier by chance than a chi-square tells.
+    that drifts makes some models likelier by chance than a chi-square tells: then, and
+    with states of a load, that must be beyond doubt, or parts held out confirm it.
     """
     n_trend = first.evidence.free.n_trend
     several, own = len(first.model.C) > 1, first.selection.order
     tried = [samples.having(method="pbsid", offset=DETRENDS[n_trend])]
     if samples.choices.order is None:  # as many at least, of which inputs reach all
         tried += [tried[0].having(n_noise_states=n) for n in (own, own + 1)]
-    least = _deviance(first)
-    least -= CERTAIN if first.evidence.whitening.of_differences else 0.0
+    least, drifts = _deviance(first), first.evidence.whitening.of_differences
     best, error, n_joint = first, None, -1
     for chosen in tried:
         if chosen.choices.n_noise_states <= n_joint:
@@ -331,8 +331,8 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
         if not isinstance(evidence, ClosedLoopEvidence):
             continue
         n_joint, deviance = len(evidence.kept), _deviance(other)
-        doubt = 0.0 if evidence.kept.all() else CERTAIN
-        if other.grows() or not deviance < least - doubt:
+        doubt = CERTAIN * (int(best is first and drifts) + int(not evidence.kept.all()))
+        if other.grows() or not deviance < least:
             continue
         if len(evidence.one_step.noise.A):
             continue
@@ -340,8 +340,12 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
             continue  # what moves it is all called noise
         error = error or samples.errors_held_out(first)
         its = chosen.errors_held_out(other)
+        far_better = its.total < _FAR_BETTER * error.total
+        confirmed = far_better or its.clearly_better_than(error, DOUBT)
+        if not confirmed and not deviance < least - doubt:
+            continue
         more = several and other.selection.order > own
-        if more and not its.total < _FAR_BETTER * error.total:
+        if more and not far_better:
             continue
         if not error.clearly_better_than(its, DOUBT):
             best, least = other, deviance
