@@ -134,6 +134,8 @@ def warn_of_disorder(
     index = getattr(X, "index", None)
     if not isinstance(index, pd.Index) or index.inferred_type not in _TELLING:
         return
+    if isinstance(index, pd.RangeIndex) and index.step > 0 and len(groups) == 1:
+        return  # the usual case
     numbers = _as_numbers(index)
     for rows in groups:
         labels = index[rows]

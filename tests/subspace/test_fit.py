@@ -493,14 +493,15 @@ def test_what_a_logger_writes_where_nothing_was_measured_is_told():
 
     assert told([], 0.0) == []
     (message,) = told([500], -9999.0, "flow", "T")
-    assert "Input 'flow' is -9999 in 1 sample(s), as other channels" in message
+    assert "Input 'flow' is -9999 in 1 sample(s), far from" in message
+    assert "where other channels are, too" in message
     (message,) = told([200, 201, 500], -9999.0, "flow")
     assert "Input 'flow' is -9999 in 3 sample(s), far from" in message
     assert "sample 200" in message and "missing='split'" in message
     (message,) = told([77], 32767.0, "T")
     assert "Output 'T' is 32767 in 1 sample(s)" in message
     (message,) = told([77, 80], -4000.0, "flow", "T")  # no code, but in both
-    assert "other channels" in message
+    assert "where other channels are, too" in message
 
 
 @pytest.mark.parametrize("size", [20.0, 1e3])

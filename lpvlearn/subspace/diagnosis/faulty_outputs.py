@@ -102,10 +102,11 @@ def tell_of_codes(pairs: Pairs, telling: Telling) -> None:
         telling.once(
             "codes",
             f"{called[k]} {names[k](i)} is {value:.6g} in {np.count_nonzero(there)} "
-            f"sample(s){', as other channels are far out there' * alike}, far from "
-            "all its other values, as loggers write where nothing was measured; the "
-            f"first is sample {where}, counted from 0. Put NaN in place of these "
-            "samples and use missing='split', or 'estimate' where they are outputs.",
+            "sample(s), far from all its other values"
+            f"{', where other channels are, too' * alike}, as loggers write where "
+            f"nothing was measured; the first is sample {where}, counted from 0. Put "
+            "NaN in place of these samples and use missing='split', or 'estimate' "
+            "where they are outputs.",
         )
         return
 
