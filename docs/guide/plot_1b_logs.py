@@ -196,11 +196,11 @@ print(round(score, 4), caught[0].message, sep="\n")
 # Starts in mid-motion
 # --------------------
 # ``predict`` and ``score`` simulate from rest. scikit-learn's default splits cut a
-# record into blocks, of which only the first starts there. The scores below are not
-# those of poor models, and a warning says so: it estimates the initial state from the
-# outputs, and looks whether that explains much more than chance would. (With the
-# ``time`` column, the models of the inner folds would be refused: their training has a
-# hole.)
+# record into blocks, of which only the first starts there. The scores below are too
+# low for their models, and a warning says so: it estimates the initial state from the
+# outputs, and looks whether that explains much more than chance would. (Another one,
+# by the index, says that the training of the inner folds has a hole. With the ``time``
+# column they would be refused.)
 
 from sklearn.model_selection import cross_val_score
 
@@ -208,7 +208,7 @@ alone = SubspaceLTI(2, horizon=10, feedthrough=False, sampling_time=STEP)
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     from_rest = cross_val_score(alone, X[["force"]][:500], y[:500])
-print(caught[0].message)
+print(next(w.message for w in caught if "mid-motion" in str(w.message)))
 
 # %%
 # The remedy is another split (:class:`~lpvlearn.ExperimentSplit`), or, as long as there

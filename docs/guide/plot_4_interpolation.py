@@ -76,8 +76,9 @@ display = ParameterDisplay.from_estimator(pipeline, others={"truth": truth})
 # -------------
 # A low one, with more points than coefficients, smooths the noise of the local models;
 # a high one follows them. ``report_`` has the distance from each gray-box model to the
-# interpolated one (:math:`H_\infty` norm, relative), the FIT of Eq. (36) is a summary
-# per matrix:
+# interpolated one (:math:`H_\infty` norm, relative), and a FIT in which every parameter
+# counts alike. That of Eq. (36), as in Table 3, counts entries by their size, per
+# matrix:
 
 import pandas as pd
 

@@ -84,7 +84,7 @@ log.describe().loc[["count", "min", "max"]].round(2)
 # %%
 # One row is missing in every record, and one temperature. ``missing="split"`` cuts
 # there. The speed is held as well as a fan holds it; its mean over a record is the
-# operating point, and ``scheduling_tol`` says which means are one point. The
+# operating point, and how far it moves tells which means are one point. The
 # temperature stands about that of the room. The local models look for such constants
 # (``offset="auto"``) and find them here.
 

@@ -97,7 +97,7 @@ class _SplitOfExperiments(VersionedPickle, BaseCrossValidator):
         Parameters
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
-            Needed only with ``n_splits="all"``.
+            Needed only where their number depends on it (``n_splits="all"``).
         y : object
             Ignored.
         groups : array-like of shape (n_samples,), optional

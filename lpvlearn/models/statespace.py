@@ -728,7 +728,8 @@ class StateSpace(VersionedPickle):
     def to_scipy(self) -> Any:
         """The model as a ``scipy.signal.StateSpace``, with or without ``dt``.
 
-        What that knows: ``step()`` and ``impulse()``, ``to_zpk()`` and ``to_tf()``.
+        What that knows of one input and output: ``step()`` and ``impulse()``,
+        ``to_zpk()`` and ``to_tf()``. Of several it has no zeros; python-control does.
 
         Raises
         ------

@@ -303,10 +303,11 @@ list, default=None
         the inputs in samples ("delay_"), where there are any; the point of work, where
         `lpv_` has offsets ("u0_" of every input, "y0_" of every output); the distance
         from the gray-box model to the interpolated one (H-infinity norm, relative), and
-        the FIT (percent, Eq. (36)) of its parameters; the largest real part (1/s) of
-        the poles of `lpv_` from there half-way to the neighbours ("growth_rate", above
-        zero unstable); the parameters ("param_"), and their standard deviations
-        ("std_") where known.
+        the FIT of its parameters (percent, Eq. (36) of parameters divided by their RMS
+        over the points: each counts alike, as it does not in Table 3); the largest real
+        part (1/s) of the poles of `lpv_` from there half-way to the neighbours
+        ("growth_rate", above zero unstable); the parameters ("param_"), and their
+        standard deviations ("std_") where known.
     parameter_report_ : DataFrame
         One row per parameter: lowest and highest value over the points, median
         standard deviation, RMSE and FIT (percent) of the interpolation.

@@ -78,7 +78,8 @@ class ScheduledEstimator(ScoredFromRest, ABC):
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`; of several, where
-            they leave the convex hull of the operating points of local experiments.
+            they leave the convex hull of the operating points, where local experiments
+            told some.
         """
         check_is_fitted(self, "lpv_")
         return_std = flag("return_std", return_std)

@@ -254,7 +254,8 @@ class SubspaceLTI(ScoredFromRest):
         are chosen where refinement shows that they are worth it.
     rates_ : SubspaceLTI
         With `integrating`, fitted to the rates of these outputs: `selection_`,
-        `residual_` and what is not below are its own.
+        `residual_`, `predictor_`, `poles_std_` and methods that need the noise are its
+        own.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square; of
         "pbsid" the error of one-step prediction.
@@ -265,7 +266,8 @@ class SubspaceLTI(ScoredFromRest):
         "pbsid" predicts unstable plants, too. Sinusoids that no input moves are
         further states of its `lti`.
     poles_std_ : ndarray of complex, shape (order_,)
-        Standard deviations of the real and imaginary parts of ``lti_.poles()``.
+        Standard deviations of the real and imaginary parts of ``lti_.poles()``. Not
+        there with ``refine=False``, of which none are known.
     offset_ : {None, "constant", "linear"}
         What was estimated.
     input_offset_ : ndarray of shape (n_experiments, n_inputs)
