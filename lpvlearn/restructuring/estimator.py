@@ -1018,8 +1018,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         ValueError
             When a value is too large to be squared, or shapes do not fit.
         """
-        if np.iscomplexobj(y) and np.ndim(y) == 3:
-            y = stack_response(np.asarray(y))
+        if isinstance(y, np.ndarray) and y.dtype.kind == "c" and y.ndim == 3:
+            y = stack_response(y)
         y = squarable("y", real_array("y", y))
         if y.size == 0:
             raise ValueError("`y` must hold a row for each frequency. Got none.")

@@ -518,3 +518,13 @@ def test_ragged_ranges_and_frequencies_without_squares_are_told():
     lag = lp.GrayBoxStructure.from_template([["-a"]], [["b"]], [[1.0]])
     with pytest.raises(ValueError, match="`omega` must hold zero or numbers of at"):
         lp.GrayBoxRestructurer(lag).fit([0.1, 1e-320, 10.0], np.ones((3, 2)))
+
+
+def test_ragged_responses_have_no_score():
+    lag = lp.GrayBoxStructure.from_template([["-a"]], [["b"]], [[1.0]])
+    omega = np.array([0.1, 1.0])
+    G = lag.model([2.0, 3.0]).frequency_response(omega)
+    fitted = lp.GrayBoxRestructurer(lag).fit(omega, G)
+    assert fitted.score(omega, G) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="`y` must"):
+        fitted.score(omega, [[1], [1, 2]])
