@@ -136,7 +136,7 @@ def warn_of_disorder(
         return
     if isinstance(index, pd.RangeIndex) and index.step > 0 and len(groups) == 1:
         return  # the usual case
-    numbers = _as_numbers(index)
+    numbers, ordered = _as_numbers(index), np.empty(0)
     for rows in groups:
         labels = index[rows]
         if index.inferred_type in _ORDERED and labels.is_unique:
@@ -162,8 +162,11 @@ def warn_of_disorder(
                 kind=DISORDER,
             )
             return
-        beside = _are_among(numbers, numbers[rows][torn] + step, _OFF * step)
-        if len(torn) and not beside.sum() > len(torn) // 2:  # no others take turns
+        if not len(torn):
+            continue
+        ordered = ordered if len(ordered) else np.sort(numbers)
+        beside = _are_among(ordered, numbers[rows][torn] + step, _OFF * step)
+        if not beside.sum() > len(torn) // 2:  # no others take turns
             where = int(torn[0])
             warn(
                 "Rows of X are missing within an experiment: its index goes from "
@@ -225,11 +228,11 @@ def _as_numbers(index: pd.Index) -> Array:
     return np.asarray(index.to_numpy(dtype=np.float64, na_value=np.nan))
 
 
-def _are_among(numbers: Array, wanted: Array, within: float) -> NDArray[np.bool_]:
-    """Which of the `wanted` numbers are there, or others so near."""
-    ordered = np.append(np.sort(numbers), np.inf)
-    found = ordered[np.searchsorted(ordered[:-1], wanted - within)]
-    return np.asarray(found <= wanted + within)
+def _are_among(ordered: Array, wanted: Array, within: float) -> NDArray[np.bool_]:
+    """Which of the `wanted` numbers are among sorted ones, or others so near."""
+    place = np.searchsorted(ordered, wanted - within)
+    found = ordered[np.minimum(place, len(ordered) - 1)]
+    return (place < len(ordered)) & (found <= wanted + within)
 
 
 def _typical_step(column: Array) -> float:
