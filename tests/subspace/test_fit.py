@@ -481,7 +481,8 @@ def test_what_a_logger_writes_where_nothing_was_measured_is_told():
     y += 0.05 * rng.standard_normal(y.shape)
 
     def told(rows, value, *tables):
-        X, measured = pd.DataFrame(u, columns=["flow"]), pd.Series(y[:, 0], name="T")
+        X = pd.DataFrame(u.copy(), columns=["flow"])
+        measured = pd.Series(y[:, 0].copy(), name="T")
         if "flow" in tables:
             X.loc[rows, "flow"] = value
         if "T" in tables:
