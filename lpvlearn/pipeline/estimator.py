@@ -103,7 +103,7 @@ from .refining.errors import local_output_errors, tell_of_missed
 from .refining.starts import best_along, through
 from .reports.html_report import html_report
 from .reports.tables import Summary, Tables, summarise, tables
-from .running.memory import checked_memory, writing
+from .running.memory import checked_memory
 from .running.runner import PointRunner
 from .running.workers import check_jobs
 from .scheduled import ScheduledEstimator
@@ -742,7 +742,7 @@ list, default=None
                 units=by_name or {},
                 figures=folder,
             )
-        with writing(path), whole_file(place) as file:
+        with whole_file(place) as file:
             file.write(page.encode())
 
     def _summarised(self) -> Summary:

@@ -157,3 +157,11 @@ def test_a_dataset_has_the_models_over_the_scheduling_variables():
     some = two.to_xarray(points[:5])
     assert some["A"].sizes["point"] == 5
     assert_allclose(some["B"][2], two.at([some["kappa1"][2], some["kappa2"][2]]).B)
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    occupied = tmp_path / "file"
+    occupied.write_text("no folder")
+    for folder in (tmp_path / "none", occupied):
+        with pytest.raises(OSError, match="`path` .*m.mat': .*Make the folder"):
+            spring_lpv().to_mat(folder / "m.mat", [0.0])

@@ -28,7 +28,6 @@ from sklearn.base import BaseEstimator
 from ...exceptions import PLAIN_DTYPES, version
 from ...systems.whole_files import whole_file
 from ...validation import file_name, shown
-from ..running.memory import writing
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
 
 SCHEMA = 1  # raised when a file of today could be misread by the code of tomorrow
@@ -140,7 +139,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         raise ValueError(
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
-    with writing(path), whole_file(target) as file:
+    with whole_file(target) as file:
         file.write(buffer.getbuffer())
 
 

@@ -9,14 +9,12 @@ packages the version counts.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import inspect
 import pickle
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,10 +27,8 @@ from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
 from ...exceptions import LIBRARY, warn
+from ...systems.whole_files import unwritten as unwritten  # the command says it, too
 from ...validation import shown
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_NO_FOLDER = (errno.ENOENT, errno.ENOTDIR)
 
 
 def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
@@ -61,28 +57,6 @@ def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
             )
             return Memory(None)
     return memory
-
-
-def unwritten(place: str, error: OSError, advice: str | None = None) -> str:
-    """That a place cannot be written, what the system says of it, and what to do."""
-    if error.errno in _FULL:
-        advice = "Free space there, or take another place."
-    elif error.errno in _NO_FOLDER:
-        advice = advice or "Make the folder that it is in, or take another place."
-    else:
-        advice = advice or "Take a place where you may write."
-    return f"{place}: it cannot be written ({error.strerror or error}). {advice}"
-
-
-@contextmanager
-def writing(path: Any) -> Iterator[None]:
-    """Say of a `path` that cannot be written what to do."""
-    try:
-        yield
-    except OSError as error:
-        told = type(error)(unwritten(f"`path` {str(path)!r}", error))
-        told.errno = error.errno
-        raise told from error
 
 
 @dataclass(frozen=True)
