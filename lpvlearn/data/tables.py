@@ -281,8 +281,7 @@ def checked_array(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         kind = ValueError if isinstance(error, ArithmeticError) else type(error)
         flat = entries.ravel()
         k = first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
-        flat_enough = 0 < entries.ndim <= 2
-        if k is not None and flat_enough:  # a sparse matrix has none
+        if k is not None and 0 < entries.ndim <= 2:  # a sparse matrix has none
             at = zip(
                 ("row", "column"), np.unravel_index(k, entries.shape), strict=False
             )

@@ -695,6 +695,16 @@ class StateSpace(VersionedPickle):
             )
         return self._of(A, B, C, D, input_delay=dt * self.input_delay)
 
+    def _refuse_delay(self, asked_by: str, other: str) -> None:
+        """Refuse a delay, which the models of another library do not have."""
+        if self.input_delay.any():
+            raise ValueError(
+                f"`{asked_by}` needs a model without delay, which {other} does not "
+                f"know. Got {self}. Make states of it by absorb_delay() (in continuous "
+                "time after to_discrete(sampling_time)), or leave it out by "
+                "with_input_delay(0)."
+            )
+
     def to_control(self, **names: Any) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control).
 
@@ -710,13 +720,7 @@ class StateSpace(VersionedPickle):
         ValueError
             If the model has a delay, which python-control does not know.
         """
-        if self.input_delay.any():
-            raise ValueError(
-                "`to_control` needs a model without delay, which python-control does "
-                f"not know. Got {self}. Make states of it by absorb_delay() (in "
-                "continuous time after to_discrete(sampling_time)), or leave it out by "
-                "with_input_delay(0)."
-            )
+        self._refuse_delay("to_control", "python-control")
         control = optional_module("control", "to_control", "control")
         for key in ("inputs", "outputs"):
             own = getattr(self, f"{key[:-1]}_names")
@@ -743,13 +747,7 @@ class StateSpace(VersionedPickle):
         >>> response.round(3)
         array([0., 3.])
         """
-        if self.input_delay.any():
-            raise ValueError(
-                "`to_scipy` needs a model without delay, which SciPy does not know. "
-                f"Got {self}. Make states of it by absorb_delay() (in continuous time "
-                "after to_discrete(sampling_time)), or leave it out by "
-                "with_input_delay(0)."
-            )
+        self._refuse_delay("to_scipy", "SciPy")
         from scipy import signal
 
         options = {} if self.is_continuous else {"dt": self.sampling_time}

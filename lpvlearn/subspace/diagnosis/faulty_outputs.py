@@ -95,10 +95,9 @@ def tell_of_codes(pairs: Pairs, telling: Telling) -> None:
         alike = any(other != k and (at == there).all() for other, _, _, at in found)
         if not (alike or is_code(value)):
             continue
-        lengths = [len(u) for u, _ in pairs]
-        first, starts = int(there.argmax()), np.cumsum([0, *lengths])
-        e = int(np.searchsorted(starts, first, side="right")) - 1
-        where = in_experiment(first - starts[e], e, len(pairs))
+        by_experiment = np.split(there, np.cumsum([len(u) for u, _ in pairs[:-1]]))
+        e = next(e for e, own in enumerate(by_experiment) if own.any())
+        where = in_experiment(by_experiment[e].argmax(), e, len(pairs))
         telling.once(
             "codes",
             f"{called[k]} {names[k](i)} is {value:.6g} in {np.count_nonzero(there)} "

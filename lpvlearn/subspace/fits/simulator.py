@@ -187,12 +187,13 @@ class Simulator(NamedTuple):
 
     def begins_away_from(self, experiment: Experiment) -> bool:
         """Whether inputs move about a level that they begin at rest far from."""
-        u = experiment.inputs
-        if not (self.evidence.free.n_trend and self.beginning(experiment) is None):
+        if not self.evidence.free.n_trend:
             return False
+        u = experiment.inputs
         u0, low, high = self.resting_point()[0], u.min(axis=0), u.max(axis=0)
         gap = np.maximum(low - u0, u0 - high)
-        return bool(((low < high) & (gap > _AWAY * (high - low))).any())
+        away = ((low < high) & (gap > _AWAY * (high - low))).any()
+        return bool(away) and self.beginning(experiment) is None
 
     def own_part(
         self,
