@@ -97,8 +97,7 @@ def resample(
     is kept. What a linear system makes of a filtered input is the filtered output: the
     model stays the same. Above the sampling frequency of the coarse grid everything is
     30 dB down; from half of it on, by 6 dB and more, what is left folds back, in inputs
-    and outputs alike. Longer filters, steeper there, give no better models, and lose
-    more beside gaps.
+    and outputs alike. Longer filters are steeper there, and lose more beside gaps.
 
     Interpolation smooths noise, and noise that was white is so no longer: resample
     where `time_tol` does not do, not always.
