@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 # Share of the squared errors that later inputs leave where the outputs lead them; or
 # where half the states are enough beside these, as for inputs that foretell themselves
 _LED, _NO_MORE = 0.1, 0.9
+_NEARLY_LED = 0.5  # beyond which half the states are asked before any number
 _LINE = 1.0  # time constants per experiment of a mode that may be a reference's line
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
@@ -190,21 +191,26 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     later = later._replace(pairs=with_later_inputs(pairs, lead)).aside()
     error = samples.errors_held_out(fitted)
     led = _OF_NOISE if fitted.grows() else _LED
-    # One order tells whether it is worth while to look for the best.
-    first = choices.order or max(1, fitted.selection.order)
-    for order, share in {first: _NO_MORE, choices.order: led}.items():
-        later = later.having(order=order)
-        try:
-            other = later.fit(n_trend)
-        except TooFewSamples:
-            return
-        if other.feedback is None or other.feedback.found:
-            return
-        found = later.errors_held_out(other)
-        if order is None and 2 * other.selection.order <= fitted.selection.order:
-            share = _NO_MORE
-        if not found.total < share * error.total:
-            return
+    own = fitted.selection.order
+
+    def beside(order: int | None) -> tuple[LocalFit | None, HeldOut]:
+        """A model without feedback, and what its like leaves of parts held out."""
+        chosen = later.having(order=order)
+        other = chosen.tried(n_trend)
+        if other is None or other.feedback is None or other.feedback.found:
+            return None, HeldOut([], np.nan)
+        return other, chosen.errors_held_out(other)
+
+    # Few orders tell whether it is worth while to look for the best.
+    other, found = beside(choices.order or max(1, own))
+    if choices.order is None and found.total < _NO_MORE * error.total:
+        if not found.total < _NEARLY_LED * error.total:
+            found = beside(max(1, own // 2))[1]
+        if found.total < _NO_MORE * error.total:
+            other, found = beside(None)
+    fewer = choices.order is None and other and 2 * other.selection.order <= own
+    if other is None or not found.total < (_NO_MORE if fewer else led) * error.total:
+        return
     # A reference of a few lines is the free motion of modes that do not decay.
     longest = max(len(u) for u, _ in later.pairs)
     if 1.0 - spectral_radius(other.model.A) >= _LINE / longest:
