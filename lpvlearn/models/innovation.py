@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from ..exceptions import VersionedPickle
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
+    beside_transit,
     delayed,
     estimate_initial_state,
     free_responses,
@@ -279,9 +280,9 @@ class InnovationModel(VersionedPickle):
         else:
             error, (gains, _) = y - self.predict(u, y), self._filter_gains(y)
             responses = prediction_responses(self.A, self.C, gains, len(y), trend)
-            states, trends = np.split(responses, [len(self.A)], axis=2)
-            transit = self._transit_responses(gains, len(y))
-            responses = np.concatenate([states, transit, trends], axis=2)
+            A, B = self.A - gains @ self.C, self.B - gains @ self.D
+            known = A, B, self.C, self.D, self.lti.input_delay
+            responses = beside_transit(responses, *known)
         return estimate_initial_state(responses, error, self.error_sizes(y))
 
     def error_sizes(self, y: Array) -> Array:
@@ -296,18 +297,6 @@ class InnovationModel(VersionedPickle):
             return spread_of(y)
         own = np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
         return np.maximum(own, _CLEAN * spread_of(y))
-
-    def _transit_responses(self, gains: Array, n_samples: int) -> Array:
-        """Of one-step prediction to every input in transit, as of `with_transit`."""
-        delay = self.lti.input_delay
-        n_late = int(delay.sum())
-        if not n_late:
-            return np.zeros((n_samples, self.lti.n_outputs, 0))
-        none = np.zeros((n_samples, self.lti.n_inputs, n_late))
-        late = delayed(none, delay, np.eye(n_late))
-        forcing = self.B @ late - gains @ (self.D @ late)
-        x = state_trajectory(self.A - gains @ self.C, forcing)
-        return self.C @ x + self.D @ late
 
     def _filter_gains(self, y: Array) -> tuple[Array, NDArray[np.bool_]]:
         """K, one for every sample where outputs are missing, and which are known."""

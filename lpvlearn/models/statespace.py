@@ -28,12 +28,12 @@ from ..systems.sampling import (
     sample_zoh_late,
 )
 from ..systems.simulation import (
+    beside_transit,
     delayed,
     estimate_initial_state,
     free_responses,
     lti_response,
     spread_of,
-    with_transit,
 )
 from ..validation import (
     finite_samples,
@@ -798,7 +798,8 @@ def unknown_responses(
     `StateSpace.estimate_initial_state` returns, and multiples of trends.
     """
     free = free_responses(model.A, model.C, n_samples, trend)
-    return with_transit(free, model.B, model.D, model.input_delay)
+    matrices = model.A, model.B, model.C, model.D
+    return beside_transit(free, *matrices, model.input_delay)
 
 
 def balanced_models(models: Sequence[StateSpace]) -> list[StateSpace]:

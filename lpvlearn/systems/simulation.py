@@ -101,23 +101,21 @@ def delayed(u: Array, delay: NDArray[np.intp], before: Array | None = None) -> A
     return late
 
 
-def with_transit(free: Array, B: Array, D: Array, delay: NDArray[np.intp]) -> Array:
+def beside_transit(
+    free: Array, A: Array, B: Array, C: Array, D: Array, delay: NDArray[np.intp]
+) -> Array:
     """Free responses, with those to the inputs in transit after those to the states.
 
     `free` comes from `free_responses`, trends or not; inputs are in the order of
-    `delayed`.
+    `delayed`. A and B may be one for every sample.
     """
-    if not delay.any():
+    n, n_late = C.shape[1], int(delay.sum())
+    if not n_late:
         return free
-    states, trends = free[:, :, : len(B)], free[:, :, len(B) :]
-    forced = np.concatenate([D[None], states @ B])[:-1]  # impulse responses
-    columns = [states]
-    for j, d in enumerate(delay):
-        late = np.zeros((*free.shape[:2], d))
-        for arrival in range(min(d, len(free))):
-            late[arrival:, :, arrival] = forced[: len(free) - arrival, :, j]
-        columns.append(late)
-    return np.concatenate([*columns, trends], axis=2)
+    none = np.zeros((len(free), D.shape[1], n_late))
+    late = delayed(none, delay, np.eye(n_late))
+    transit = C @ state_trajectory(A, B @ late) + D @ late
+    return np.concatenate([free[:, :, :n], transit, free[:, :, n:]], axis=2)
 
 
 def trend_signals(n_samples: int, n_trend: int) -> Array:
@@ -146,6 +144,16 @@ def free_responses(
         return free
     trends = [np.multiply.outer(t, np.eye(len(C))) for t in trend]
     return np.concatenate([free, *trends], axis=2)
+
+
+def input_responses(A: Array, C: Array, u: Array) -> Array:
+    """Outputs to every entry of B alone, (n_samples, n_outputs, n, n_inputs).
+
+    Of the transposed system the states are the answers to rows of B.
+    """
+    driven = np.einsum("ai,tj->tiaj", C, u).reshape(len(u), len(A), -1)
+    x = state_trajectory(A.T, driven)
+    return x.reshape(len(u), len(A), len(C), -1).swapaxes(1, 2)
 
 
 def state_and_level(own: Array, trend: Array, n_outputs: int) -> tuple[Array, Array]:

@@ -187,7 +187,7 @@ def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     lead, latest = find_lead(pairs)
     if not lead:
         return
-    later = samples.having(method="auto", offset=DETRENDS[n_trend], estimated=())
+    later = samples.having(method="po-moesp", offset=DETRENDS[n_trend], estimated=())
     later = later._replace(pairs=with_later_inputs(pairs, lead)).aside()
     error = samples.errors_held_out(fitted)
     led = _OF_NOISE if fitted.grows() else _LED

@@ -70,7 +70,7 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     refused = np.inf
     if auto and moves and not sure and may_matter():
         other = first or judged.fit(1, fitted)
-        if fitted.method == "pbsid" and other.worse_than(fitted) > 0.0:
+        if first and fitted.method == "pbsid" and other.worse_than(fitted) > 0.0:
             # In a loop it can only be likelier, if it begins at the other as well.
             other = judged.fit(1, fitted)
         order = len(fitted.model.A)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ...models.innovation import NoiseModel, prediction_responses
 from ...systems.least_squares import scaled_lstsq
 from ...systems.modes import spectral_radius
-from ...systems.simulation import state_trajectory
+from ...systems.simulation import input_responses
 from ..evidence.statistics import Evidence
 from ..orders.identification import REFITS
 from ..samples.records import Record, ScaledRecords, share_known
@@ -203,10 +203,7 @@ class ByInputs(NamedTuple):
         errors = prediction_errors(none, records, free)[1]
         for record, e in zip(records, errors, strict=True):
             u = record.u.T
-            # of the transposed system the states are the answers to rows of B
-            driven = np.einsum("ai,tj->tiaj", C, u).reshape(len(u), n, -1)
-            x = state_trajectory((A - K @ C).T, driven).reshape(len(u), n, *D.shape)
-            by_B = -x.swapaxes(1, 2)  # (n_samples, n_outputs, n, n_inputs)
+            by_B = -input_responses(A - K @ C, C, u)
             by_D = -np.einsum("ac,tj->tacj", outputs, u)
             by_D -= np.einsum("ic,taij->tacj", K, by_B)
             X = by_B.reshape(*e.shape, -1), by_D[:, :, free.direct], e[:, :, None]

@@ -62,12 +62,12 @@ def _better_horizon(fitted: LocalFit, settings: Settings) -> tuple[int, float] |
     highest = highest_horizon(records, settings)
     none = Whitening.none(len(records[0].y))
     # One that minimises other errors is not to blame for those of simulation.
-    own = fit_once(records, order, horizon, settings, none).candidate
+    own = fit_once(records, order, horizon, settings, none)
     residual = min(residual, float(np.sqrt(own.model.loss / energy)))
     for other in (2 * horizon, 4 * horizon, horizon // 2):
         if not 2 <= other <= highest or settings.max_order(other) < order:
             continue
-        trial = fit_once(records, order, other, settings, none).candidate
+        trial = fit_once(records, order, other, settings, none)
         error = float(np.sqrt(trial.model.loss / energy))
         if error < _CLEARLY_BETTER * residual:
             return other, error

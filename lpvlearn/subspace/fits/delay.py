@@ -408,8 +408,7 @@ class _Trial:
             return [np.full_like(r.y.T, np.inf) for r in records]
         # Along the valleys of smooth inputs, steps without an end tell no delays apart.
         none = Whitening.none(len(heads[0].y))
-        found = fit_once(heads, order, horizon, settings, none, patient=False)
-        model = found.candidate.model
+        model = fit_once(heads, order, horizon, settings, none, patient=False).model
         if part == 1.0:
             cuts = [0] * len(cuts)
         errors = simulation_errors(model, records)

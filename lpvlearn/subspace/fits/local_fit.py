@@ -79,7 +79,8 @@ class LocalFit(NamedTuple):
         evidence, horizon = self.evidence, self.selection.horizon
         ratio = evidence.output_scale / output_scale
         model = evidence.model._replace(C=evidence.model.C * ratio[:, None])
-        return Candidate(model, horizon, evidence.whitening, True, self.signals)
+        like = model, horizon, evidence.whitening, evidence.refined
+        return Candidate(*like, self.signals)
 
     def grows(self, *, surely: bool = False) -> bool:
         """Whether a pole is outside the unit circle, `surely` by more than chance."""

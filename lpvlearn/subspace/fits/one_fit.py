@@ -21,7 +21,7 @@ from ..closed_loop.varx import Feedback, find_feedback
 from ..evidence.constants import with_levels, without_slow_modes
 from ..evidence.offsets import attributed
 from ..evidence.statistics import Evidence
-from ..orders.identification import Candidate, Settings, identify, validate
+from ..orders.identification import Settings, identify, validate
 from ..orders.selection import PlantFit, Row, Selection, select
 from ..samples.records import (
     Record,
@@ -193,12 +193,7 @@ class Samples(NamedTuple):
         free = evidence.free._replace(initial_states=True)  # what is left is in motion
         settings = fitted.settings(choices)._replace(free=free)
         if fitted.method != "pbsid":
-            like = Candidate(
-                evidence.model,
-                fitted.selection.horizon,
-                evidence.whitening,
-                evidence.refined,
-            )
+            like = fitted.candidate(evidence.output_scale)
             return validate(like, scaled.records, settings)
 
         refitted: Callable[[list[Record]], Realization]

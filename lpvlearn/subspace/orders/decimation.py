@@ -104,7 +104,7 @@ class SlowStarts:
         horizon = min(_HORIZON, max(2, _MAX_ROWS // height), room)
         highest = min(self._highest, settings.max_order(horizon))
         width = min(highest + settings.n_noise_states, settings.max_order(horizon))
-        spaces = subspaces_of(records, {horizon: width}, settings.method)
+        spaces = subspaces_of(records, {horizon: width}, settings)
         return _Decimated(records, spaces[horizon], highest)
 
 

@@ -73,7 +73,7 @@ class FurtherStates:
         if not np.isfinite(model.loss) or settings.max_order(horizon) < 1:
             return None
         left = [Record.of(r.u.T, e) for r, e in zip(records, errors, strict=True)]
-        space = subspaces_of(left, {horizon: 1}, settings.method)[horizon]
+        space = subspaces_of(left, {horizon: 1}, settings)[horizon]
         more = realize(space, left, 1, settings._replace(n_noise_states=0))
         A, C = linalg.block_diag(model.A, more.A), np.hstack([model.C, more.C])
         return simulation_fit(A, C, records, settings.free)

@@ -6,7 +6,7 @@ sequence: the function core of `lpvlearn.subspace.SubspaceLTI`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +88,8 @@ class Settings(NamedTuple):
         [False, True, True, False]
         """
         n_outputs, n_inputs = self.free.direct.shape
-        return _too_few(lengths, n_inputs, n_outputs)
+        together = _fill(lengths, 2, n_inputs + n_outputs)
+        return not together and _fill(lengths, 2, n_inputs + 1)
 
     def max_order(self, horizon: int) -> int:
         """Largest order that a horizon can show of these channels.
@@ -137,11 +138,6 @@ def _fill(lengths: Sequence[int], horizon: int, n_channels: int) -> bool:
     return n_columns >= 2 * n_channels * horizon
 
 
-def _too_few(lengths: Sequence[int], n_inputs: int, n_outputs: int) -> bool:
-    together = _fill(lengths, 2, n_inputs + n_outputs)
-    return not together and _fill(lengths, 2, n_inputs + 1)
-
-
 class Candidate(NamedTuple):
     """A model of scaled records, and how it came about."""
 
@@ -150,6 +146,7 @@ class Candidate(NamedTuple):
     whitening: Whitening  # of the errors whose squares it minimises
     refined: bool
     signals: SharedSignals | None = None  # of other records that it is near to
+    singular_values: Array = np.zeros(0)  # of its subspace, if that was asked
 
 
 class Identified(NamedTuple):
@@ -166,7 +163,7 @@ class Identified(NamedTuple):
 def subspaces_of(
     records: Sequence[Record],
     widths: Mapping[int, int],
-    method: str,
+    settings: Settings,
     *,
     cheap: bool = False,
 ) -> Mapping[int, Subspace]:
@@ -176,13 +173,13 @@ def subspaces_of(
     free of noise, that many of them are linearly dependent to working precision. Of
     samples that are too few for all outputs together each output has its own.
     """
-    m, ny = len(records[0].u), len(records[0].y)
-    if max(widths) == 1 or not _too_few([r.n_samples for r in records], m, ny):
+    method = settings.method
+    if max(widths) == 1 or not settings.too_few([r.n_samples for r in records]):
         return _subspaces_of_all(records, widths, method, cheap=cheap)
     of_one = {horizon: horizon - 1 for horizon in widths}
     alone = [
         _subspaces_of_all([r._replace(y=r.y[[i]]) for r in records], of_one, method)
-        for i in range(ny)
+        for i in range(len(records[0].y))
     ]
     return {h: SubspacesApart([spaces[h] for spaces in alone]) for h in widths}
 
@@ -256,13 +253,6 @@ def realize(
     return as_found if as_found.loss * limit + rounding < stable.loss else stable
 
 
-class Fitted(NamedTuple):
-    """A candidate, and the singular values of its subspace."""
-
-    candidate: Candidate
-    singular_values: Array
-
-
 def fit_once(
     records: Sequence[Record],
     order: int,
@@ -272,14 +262,14 @@ def fit_once(
     start: Realization | None = None,
     *,
     patient: bool = True,
-) -> Fitted:
+) -> Candidate:
     """Model of whitened records, from their subspace or another model of them.
 
     `patient` is as in `refine_simulation`.
     """
     white = whitening.records(records, settings.free)
     width = {horizon: order + settings.n_noise_states}
-    subspace = subspaces_of(white, width, settings.method)[horizon]
+    subspace = subspaces_of(white, width, settings)[horizon]
     model = realize(subspace, white, order, settings)
     if settings.refine:
         if start is not None:
@@ -288,37 +278,32 @@ def fit_once(
                 model = other
         model = refine_simulation(model, white, settings.free, patient=patient)
     model = of_records(model, records, whitening, settings.free)
-    candidate = Candidate(model, horizon, whitening, settings.refine)
-    return Fitted(candidate, subspace.singular_values)
+    values = subspace.singular_values
+    return Candidate(model, horizon, whitening, settings.refine, None, values)
 
 
 def refit(
     records: Sequence[Record],
-    order: int,
-    horizon: int,
+    near: Candidate,
     settings: Settings,
     whitening: Whitening,
-    start: Realization,
-    signals: SharedSignals | None = None,
     *,
     patient: bool = True,
-) -> Fitted:
-    """As `fit_once`, from a model that is near: the subspace is not asked.
-
-    `signals` are those of the `start` and other records.
-    """
-    white, free = whitening.records(records, settings.free), settings.free
+) -> Candidate:
+    """As `fit_once`, from a model that is near: the subspace is not asked."""
+    free, start = settings.free, near.model
+    white = whitening.records(records, free)
     one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
     if one_each and start.blocks is not None:
         model = whitening.model(start)._replace(loss=np.inf)
         model = refine_simulation(
-            model, white, free, fitted=False, patient=patient, signals=signals
+            model, white, free, fitted=False, patient=patient, signals=near.signals
         )
     else:
         model = restarted(start, whitening, white, free)
         model = refine_simulation(model, white, free, patient=patient)
-    model = of_records(model, records, whitening, settings.free)
-    return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
+    model = of_records(model, records, whitening, free)
+    return Candidate(model, near.horizon, whitening, True)
 
 
 def of_records(
@@ -359,7 +344,7 @@ def _refitted(
         model = refine_simulation(model, white, free, REFITS)
     else:
         width = {candidate.horizon: order + settings.n_noise_states}
-        spaces = subspaces_of(white, width, settings.method)
+        spaces = subspaces_of(white, width, settings)
         model = realize(spaces[candidate.horizon], white, order, settings)
     return whitening.undone(model)
 
@@ -387,11 +372,14 @@ def identify(
     """
     none = Whitening.none(len(records[0].y))
     as_found = settings._replace(enforce_stability=False)
-    first, start = (none, None) if known is None else (known.whitening, known.model)
-    fit: Callable[..., Fitted] = refit if near else fit_once
-    shared = {"signals": known.signals} if near and known is not None else {}
-    fitted = fit(records, order, horizon, as_found, first, start, **shared)
-    chosen = fitted.candidate
+
+    def fit(start: Candidate | None, whitening: Whitening) -> Candidate:
+        if near and start is not None:
+            return refit(records, start, as_found, whitening)
+        begun = None if start is None else start.model
+        return fit_once(records, order, horizon, as_found, whitening, begun)
+
+    fitted = chosen = fit(known, none if known is None else known.whitening)
     filtered = known is not None or len(records[0].y) == 1
     some, errors = shorten(records)[0], None
     for _ in range(_ROUNDS if settings.refine and settings.weigh else 0):
@@ -399,17 +387,16 @@ def identify(
             errors = simulation_errors(chosen.model, some)
         whitening = Whitening.of(errors, settings.free, filtered=filtered)
         if not whitening.is_close_to(chosen.whitening):
-            again = fit(records, order, horizon, as_found, whitening, chosen.model)
-            chosen, errors = again.candidate, None
+            chosen, errors = fit(chosen, whitening), None
         elif filtered:
             break
         else:  # the weights of the outputs are found
             filtered = True
     if settings.compare and not chosen.whitening.is_none:
-        plain = fitted.candidate
+        plain = fitted
         if not plain.whitening.is_none:
             found = [  # that which begins at the other goes astray with it
-                fit_once(records, order, horizon, as_found, none, start).candidate
+                fit_once(records, order, horizon, as_found, none, start)
                 for start in (chosen.model, None)
             ]
             plain = min(found, key=lambda candidate: candidate.model.loss)
@@ -419,14 +406,14 @@ def identify(
         chosen = _best_held_out(rivals, records, as_found)
         if not chosen.refined:
             unrefined = as_found._replace(refine=False)
-            chosen = fit_once(records, order, horizon, unrefined, none).candidate
+            chosen = fit_once(records, order, horizon, unrefined, none)
     energy = output_energy(records) or 1.0
     model, stability_loss = chosen.model, 0.0
     if (
         settings.enforce_stability
         and not spectral_radius(model.A) < 1.0 - STABLE_MARGIN
     ):
-        model = fit_once(records, order, horizon, settings, chosen.whitening)[0].model
+        model = fit_once(records, order, horizon, settings, chosen.whitening).model
         if 0.0 < chosen.model.loss < model.loss:
             stability_loss = np.sqrt(model.loss / energy)
             stability_loss -= np.sqrt(chosen.model.loss / energy)

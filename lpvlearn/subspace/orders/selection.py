@@ -416,8 +416,7 @@ def _with_own_noise(
         noise = _noise_of(candidate.model, records, wanted, settings)
         if noise.is_close_to(candidate.whitening):
             break
-        known = candidate.horizon, settings, noise, candidate.model
-        candidate = refit(records, one.order, *known, patient=False).candidate
+        candidate = refit(records, candidate, settings, noise, patient=False)
     if candidate is one.candidate:
         return one
     return _judge(one, candidate, records, settings)
@@ -513,7 +512,7 @@ def _look_up(
     if new:
         widths = {h: min(width, settings.max_order(h)) for h in new}
         cheap = wanted.horizon is None
-        found = subspaces_of(records, widths, settings.method, cheap=cheap)
+        found = subspaces_of(records, widths, settings, cheap=cheap)
         wanted.spaces.update({h: found.get(h) for h in new})
     spaces = {h: wanted.spaces[h] for h in horizons}
     return {h: space for h, space in spaces.items() if space is not None}

@@ -89,7 +89,9 @@ def data_factors(
     for k, horizon in enumerate(horizons):
         rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs)
         problem = records, 2 * horizon, rows
-        factor = _squared_factor(*problem, known.get(2 * horizon), n_trend)
+        gram = _pooled_gram(*problem, known.get(2 * horizon), n_trend)
+        factor = cholesky_factor(gram, overwrite=True)
+        del gram
         if factor is None and not (cheap and k > 0 and len(rows) > _MANY_ROWS):
             factor = _qr_factor(*problem, n_trend)
         yield factor
@@ -123,23 +125,9 @@ def hankel_factor(
     `n_trend` as in `data_factors`, of samples that have little of a trend
     (`without_trend`).
     """
-    factor = _squared_factor(records, n_rows, rows, None, n_trend)
+    gram = _pooled_gram(records, n_rows, rows, None, n_trend)
+    factor = cholesky_factor(gram, overwrite=True)
     return _qr_factor(records, n_rows, rows, n_trend) if factor is None else factor
-
-
-def _squared_factor(
-    records: Sequence[Array],
-    n_rows: int,
-    rows: NDArray[np.intp],
-    correlations: Array | None,
-    n_trend: int,
-) -> Array | None:
-    """That of the Gram matrix; None where squaring would lose accuracy.
-
-    `correlations` are known `pooled_correlations` of the records, of `n_rows` lags.
-    """
-    gram = _pooled_gram(records, n_rows, rows, correlations, n_trend)
-    return cholesky_factor(gram, overwrite=True)
 
 
 def _qr_factor(

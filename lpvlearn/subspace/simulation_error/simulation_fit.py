@@ -27,6 +27,7 @@ from ...systems.least_squares import RCOND, column_scale, scaled_lstsq, thin_svd
 from ...systems.simulation import (
     estimate_initial_state,
     free_responses,
+    input_responses,
     lti_response,
 )
 from ..samples.hankel import triangularize
@@ -266,33 +267,13 @@ def with_initial_states(
 
 
 def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Array:
-    """As `linear_regression` for any A, by the adjoint state recursion.
-
-    ``c (z I - A)^-1 B u_j`` is linear in B through the state of the model
-    ``(A.T, c)`` driven by ``u_j``. Slower, but free of any transformation.
-    """
-    (m, n_samples), (ny, n) = record.u.shape, C.shape
-    own, n_states = free.n_own(n), free.n_states(n)
-    where = np.argwhere(free.direct)
-    eye, none = np.eye(n), np.zeros((n, 1))
-    parts = []
-    for i in range(ny):
-        M = np.zeros((own + n * m + len(where) + 1, n_samples))
-        if n_states:
-            at_rest = np.zeros((n_samples, 1))
-            M[:n] = lti_response(A.T, none, eye, none, at_rest, C[i]).T
-        for j, trend in enumerate(record.trend):
-            M[n_states + j * ny + i] = trend
-        for j in range(m):
-            M[own + j : own + n * m : m] = lti_response(
-                A.T, C[i][:, None], eye, none, record.u[j][:, None]
-            ).T
-        for row, (output, j) in enumerate(where, start=own + n * m):
-            if output == i:
-                M[row] = record.u[j]
-        M[-1] = record.y[i]
-        parts.append(triangularize(M))
-    return np.vstack(parts)
+    """As `linear_regression` for any A: slower, but free of any transformation."""
+    u, y, (ny, n) = record.u.T, record.y.T, C.shape
+    own = free_responses(A, C, len(u), record.trend)[:, :, n - free.n_states(n) :]
+    by_B = input_responses(A, C, u).reshape(len(u), ny, -1)
+    by_D = np.einsum("ac,tj->tacj", np.eye(ny), u)[:, :, free.direct]
+    M = np.concatenate([own, by_B, by_D, y[:, :, None]], axis=2)
+    return np.vstack([triangularize(part.copy()) for part in M.transpose(1, 2, 0)])
 
 
 def _realization(
