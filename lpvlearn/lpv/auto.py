@@ -72,16 +72,21 @@ class AutoLPV(Interpolator):
     """Interpolation by the form that the covariances of the parameters speak for.
 
     A sample is an operating point: `X` holds its scheduling values, `y` the parameters
-    of its local model. Polynomials and rational functions compete where the covariances
-    of the parameters are known; of those whose errors can be chance, and whose
-    criterion is within 10 of the lowest, a polynomial of degree 2 at most (in each of
-    several variables: 1), and then the one with fewest coefficients, is taken.
-    Where none is left, or the covariances are not known, the interpolation follows the
-    points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
-    the logarithms of the scheduling variables, meets points that are left out, three at
-    least, with clearly smaller errors (in the geometric mean over the parameters). Of
-    two or three scheduling variables forms and curves of fewer are tried where none of
-    all of them is proven: what depends on one foresees more with that one alone.
+    of its local model.
+
+    With the covariances of the parameters, polynomials and rational functions compete.
+    Out are those whose errors cannot be chance, and those whose criterion is more than
+    10 above the lowest. Of what is left a polynomial of degree 2 at most (in each of
+    several variables: 1) is taken, and else the one with fewest coefficients.
+
+    Where none is left, or covariances are not known, the interpolation goes through
+    the points (`SplineLPV`) and keeps their shape. A cubic spline, or a curve over the
+    logarithms of the scheduling variables, takes its place if it meets points that are
+    left out, three at least, with clearly smaller errors (in the geometric mean over
+    the parameters).
+
+    Of two or three scheduling variables fewer are tried where no form of all is proven:
+    what depends on one alone is foreseen better with that one.
 
     Parameters
     ----------

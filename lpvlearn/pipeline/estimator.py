@@ -170,16 +170,21 @@ class LocalLPVPipeline(ScheduledEstimator):
         so are, where `local` is left at no delay, inputs that arrive late, by as many
         samples at all points.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
-        Step 4. Without a structure, "aligned" interpolates the entries of
-        the local models, each turned to its neighbour by the rotation that brings their
-        matrices nearest: of balanced ones, or, where points left out are clearly better
-        foreseen, of such whose inputs move all states alike, or whose outputs show them
-        alike. "passthrough": of balanced ones whose signs alone agree, the paper's
-        baseline. ``GrayBoxRestructurer()`` is the observable canonical form. None is
-        that form where `AutoLPV` finds its parameters on a polynomial of degree 2 at
-        most, or a fraction of degrees 3 together, which foresees points left out
-        as well as "aligned" does; else that. With a `refiner` it is what
-        follows the experiments that move better.
+        Step 4, which gives all local models the same states, so that their entries may
+        be interpolated:
+
+        - ``GrayBoxRestructurer(structure)``: those of your equations of motion;
+          physical parameters are interpolated.
+        - ``GrayBoxRestructurer()``: those of the observable canonical form.
+        - "aligned": those of the neighbour, to which each model is turned by the
+          rotation that brings their matrices nearest: of balanced models, or, where
+          points left out are clearly better foreseen, of such whose inputs move all
+          states alike, or whose outputs show them alike.
+        - "passthrough": those of balanced models, signs agreed: the paper's baseline.
+        - None: without a structure, the canonical form where `AutoLPV` finds its
+          parameters on a polynomial of degree 2 at most, or a fraction of degrees 3
+          together, which foresees points left out as well as "aligned" does; else that.
+          With a `refiner`, what follows the experiments that move better.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
         (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances

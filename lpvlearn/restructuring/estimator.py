@@ -234,7 +234,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     history_ : DataFrame
         Objective, and mu and Newton steps for each stage of the central path;
         predicted decrease, step bound and number of active peaks by iteration of the
-        solver.
+        solver. No rows where the start was the optimum.
 
     Notes
     -----

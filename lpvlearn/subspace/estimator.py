@@ -290,10 +290,11 @@ class SubspaceLTI(ScoredFromRest):
         still at first and move later, half of all at least. `predict` begins likewise
         where they do. False of batches.
     begun_state_ : ndarray of shape (order,) or None
-        State in which the experiments begin, their mean, where a mode does not decay
-        over them and rest is farther from their outputs than these range: `predict`
-        begins there. Outputs that integrate (`integrating`), which rest anywhere, begin
-        there wherever that is. None, as nearly always, for rest; and of batches.
+        None, as nearly always: experiments begin near rest, and so does `predict`.
+        Else the mean of the states in which they begin, for a mode that does not decay
+        over them and is farther from rest than the outputs range, as of a tank that no
+        experiment empties: `predict` begins there. With `integrating`, wherever that
+        is, as such outputs rest anywhere. None of batches.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero unless `offset_` is "linear", and where an offset of the
@@ -358,13 +359,15 @@ class SubspaceLTI(ScoredFromRest):
     ``feedthrough=False``. Channels that are not sampled at once look like a loop. So
     "auto" compares the plant of "pbsid" with other models on parts held out (growing
     modes are simulated backward), unless inputs follow from the past, as a few sines
-    do. D is left free, or "po-moesp" taken, where that leaves less than half of the
-    squared errors, or makes a plant stable that is so within its uncertainty; not
-    "po-moesp" where its best fit to these parts is below 50 % and it predicts worse, as
-    where noise moves a loop more than its reference does; "po-moesp" with D free, where
-    it leaves less than a tenth and outputs seem to know later inputs, as filtered ones,
-    or less than a quarter and nothing but answers within the sample shows a loop, as
-    noise of measured inputs makes them.
+    do. Another one is taken in its place, and that is said:
+
+    - a plant with D free, or the model of "po-moesp", that leaves less than half of the
+      squared errors there, or is stable where the plant is unstable only within its
+      uncertainty. Not that of "po-moesp" where it explains less than a best fit of
+      50 % and predicts worse: noise then moves the loop more than its reference does.
+    - "po-moesp" with D free that leaves less than a tenth, where outputs seem to know
+      later inputs, as filtered ones do; or less than a quarter, where nothing but
+      answers within the sample shows a loop, as noise of measured inputs makes them.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
