@@ -414,7 +414,7 @@ def _natural_candidates(
     near = np.abs(np.log(np.maximum(omega, 1e-300) / rate)) < 1.0
     # of several models the first one
     G = np.abs(problem.response[near if near.any() else slice(None)])
-    gains = np.sqrt(np.mean(G**2, axis=0))[: problem.structure.n_outputs].max(1)
+    gains = np.sqrt(np.mean(G**2, axis=0))[: problem.structure.n_outputs]
     sizes = equations.natural_sizes(rate, gains)
     return np.asarray(sizes * np.exp(rng.normal(size=(n_starts, len(sizes)))))
 

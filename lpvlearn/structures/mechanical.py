@@ -98,35 +98,40 @@ class ImplicitMap(StructureMap):
         return AffineMap(self.offset + S[0], S[1:])
 
     def natural_sizes(self, rate: float, gains: Array) -> Array:
-        """Positive sizes of the parameters, up to a factor, that make all terms alike.
+        """Positive sizes of the parameters that make all terms of an equation alike.
 
-        States move at `rate` (1 / s); `gains` (n_outputs,) are the sizes of the outputs
-        for inputs of size one.
+        States move at `rate` (1 / s); `gains` (n_outputs, n_inputs) are sizes of the
+        response. Least squares of logarithms: those of ``|T_k| theta_k z_j`` are to be
+        that of the level of their row of ``M X = N [x; u]``, for z of X, x and u, and
+        terms of ``offset [x; u] + W X`` those of ``rate x`` and y. What these leave
+        open is near one.
         """
-        n, dof = self.order, len(self.M[0])
-        # x_i' = a x_j: log s_j - log s_i = log rate - log |a|; the same for X
-        columns = np.hstack([self.offset[:, :n], self.W])
-        rows, values = [], []
-        for i, j in np.argwhere(columns[:n]):
-            row = np.zeros(n + dof)
-            row[j] += 1.0
-            row[i] -= 1.0
-            rows.append(row)
-            values.append(np.log(rate) - np.log(abs(columns[i, j])))
-        s = np.ones(n + dof)
-        if rows:
-            s = np.exp(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
-        outputs = (np.abs(columns[n:]) * s).max(1, initial=0.0)
-        seen = (outputs > 0) & (gains > 0)
-        if seen.any():
-            s = s * np.median(gains[seen] / outputs[seen])
-        inputs = np.ones(self.N.shape[2] - n)
-        terms = np.concatenate(
-            [np.abs(self.M) * s[n:], np.abs(self.N) * np.concatenate([s[:n], inputs])],
-            axis=2,
-        ).max((1, 2))
-        level = terms[0] if terms[0] > 0 else 1.0  # that of what holds no parameter
-        return np.asarray(level / np.where(terms[1:] > 0, terms[1:], level))
+        (q, dof, _), n = self.M.shape, self.order
+        outputs = gains.max(1, initial=0.0)
+        seen = outputs > 0.0
+        effects = (gains[seen] / outputs[seen, None]).max(0, initial=0.0)
+        inputs = 1.0 / np.where(effects > 0.0, effects, 1.0)  # that outputs show alike
+        # logarithms of parameters, X, x and levels of the rows: those that are unknown
+        eye = np.eye(q - 1 + 2 * dof + n)
+        theta = np.vstack([0.0 * eye[:1], eye[: q - 1]])
+        z, level = eye[q - 1 :], eye[q - 1 + dof + n :]
+        z = np.vstack([z[: dof + n], np.zeros((len(inputs), len(eye)))])
+        T = np.concatenate([self.M, self.N], axis=2)
+        k, i, j = np.nonzero(T)
+        rows = [theta[k] + z[j] - level[i]]
+        of_inputs = np.concatenate([np.zeros(dof + n), np.log(inputs)])
+        values = [-np.log(np.abs(T[k, i, j])) - of_inputs[j]]
+        moved = np.vstack([z[dof : dof + n], np.zeros((len(outputs), len(eye)))])
+        sizes = np.log(np.concatenate([np.full(n, rate), np.where(seen, outputs, 1.0)]))
+        T = np.hstack([self.W, self.offset[:, :n]])
+        i, j = np.nonzero(T * np.concatenate([np.ones(n), seen])[:, None])
+        rows.append(z[j] - moved[i])
+        values.append(sizes[i] - np.log(np.abs(T[i, j])))
+        # stacked outputs say no more than those of one
+        found = np.column_stack([np.vstack(rows), np.concatenate(values)])
+        found = np.unique(found, axis=0)
+        logs = np.linalg.lstsq(found[:, :-1], found[:, -1], rcond=None)[0]
+        return np.asarray(np.exp(logs[: q - 1]))
 
     def regular_point(self) -> Array:
         """Parameters that bring M near the identity, so that S exists there."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
@@ -304,3 +305,28 @@ def test_a_parameter_beside_bounds_at_zero_is_not_taken_for_silent():
     problem = problem_from_models(structure, [StateSpace(-2, 3, 1)], None)
     for seed in range(20):
         assert starts._without_effect(problem, np.random.default_rng(seed)) == []
+
+
+def test_equations_in_any_units_are_found_from_nothing():
+    # a mass on a spring, and a motor that drives a load through a shaft
+    spring = GrayBoxStructure.from_template(
+        E=[[1, 0], [0, "m"]], A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]]
+    )
+    shaft = GrayBoxStructure.from_template(
+        E=[[1, 0, 0], [0, "Jm", 0], [0, 0, "Jl"]],
+        A=[[0, 1, -1], ["-k", "-d - bm", "d"], ["k", "d", "-d - bl"]],
+        B=[[0], [1], [0]],
+        C=[[0, 1, 0], [0, 0, 1]],
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        m, w = 10.0 ** rng.uniform([-9, 0], [3, 5])
+        of_spring = {"m": m, "k": m * w**2, "c": 0.1 * m * w}
+        of_shaft = {"Jm": m, "Jl": 4 * m, "k": m * w**2}
+        of_shaft |= {"d": 0.05 * m * w, "bm": 0.1 * m * w, "bl": 0.05 * m * w}
+        for structure, truth in ((spring, of_spring), (shaft, of_shaft)):
+            found = GrayBoxRestructurer(structure).fit_model(
+                structure.model(truth).balance()
+            )
+            expected = [truth[name] for name in structure.parameter_names]
+            assert_allclose(found.params_, expected, rtol=1e-6)

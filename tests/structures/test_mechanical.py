@@ -201,11 +201,42 @@ def test_searches_begin_in_the_equations_of_motion_in_either_state():
         for state in ("rate", "momentum")
     )
     assert_array_equal(momenta.reference, rates.reference)
-    gains = np.array([0.1, 0.2])
+    gains = np.array([[0.1], [0.2]])
     assert_array_equal(
         momenta.implicit.natural_sizes(3.0, gains),
         rates.implicit.natural_sizes(3.0, gains),
     )
+
+
+def test_natural_sizes_make_all_terms_of_an_equation_alike():
+    # m x'' = -c x' - k x + u, where x is `gain` of u and moves at `rate`
+    rate, gain = 3e5, 2e-7
+    alike = {"c": 1.0 / (gain * rate), "k": 1.0 / gain, "m": 1.0 / (gain * rate**2)}
+    by_motion = MECHANICAL([["m"]], [["c"]], [["k"]], [[1]])
+    by_cells = GrayBoxStructure.from_template(
+        E=[[1, 0], [0, "m"]],
+        A=[[0, 1], ["-k", "-c"]],
+        B=[[0], [1]],
+        C=[[1, 0]],
+    )
+    for structure in (by_motion, by_cells):
+        found = structure.implicit.natural_sizes(rate, np.array([[gain]]))
+        expected = [alike[name] for name in structure.parameter_names]
+        assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_the_unit_of_an_output_moves_the_natural_size_of_its_sensor_alone():
+    structure = GrayBoxStructure.from_template(
+        E=[["Ca", 0], [0, "Cw"]],
+        A=[["-g - v", "g"], ["g", "-g - w"]],
+        B=[["a", "v"], [0, "w"]],
+        C=[[1, 0], [0, "s"]],
+    )
+    gains = np.array([[2.0, 0.1], [0.4, 0.3]])
+    first = structure.implicit.natural_sizes(1e-3, gains)
+    gains[1] *= 1e4
+    expected = first * np.where(np.array(structure.parameter_names) == "s", 1e4, 1.0)
+    assert_allclose(structure.implicit.natural_sizes(1e-3, gains), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("state", ["rate", "momentum"])
@@ -219,9 +250,9 @@ def test_stacked_outputs_are_those_of_the_same_equations(state):
         assert_allclose(T[..., :n, :], S[..., :n, :], rtol=1e-12, atol=1e-12)
         outputs = np.concatenate([S[..., n:, :]] * 3, axis=-2)
         assert_allclose(T[..., n:, :], outputs, rtol=1e-12, atol=1e-12)
-    gains = np.array([0.1, 0.2])
+    gains = np.array([[0.1], [0.2]])
     assert_allclose(
-        stacked.implicit.natural_sizes(3.0, np.tile(gains, 3)),
+        stacked.implicit.natural_sizes(3.0, np.tile(gains, (3, 1))),
         structure.implicit.natural_sizes(3.0, gains),
     )
     assert not stacked.free_feedthrough.any()
