@@ -386,7 +386,8 @@ print(told[0].message)
 #   constant of its own; ``"estimate"`` estimates outputs that are missing, and ends an
 #   experiment where inputs are: :ref:`guide_logs`.
 # * ``integrating="angle"`` identifies the rate of an output that integrates, and
-#   integrates the model: see the example of a position servo. A pipeline without a
+#   integrates the model: see the example of a position servo. What inputs do to it at
+#   once (a current to the voltage of a battery) is kept as D. A pipeline without a
 #   structure interpolates the model of the rates, and integrates that, also where it
 #   finds itself, and says, that an output integrates at all points.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what

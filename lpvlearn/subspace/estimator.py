@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from numbers import Integral
-from typing import Any, Self, cast
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,7 @@ from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
 from ..data.scoring import ScoredFromRest
 from ..data.tables import Table, n_rows_of
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing, collected, warn
+from ..exceptions import all_or_nothing, collected, repeat, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.threads import one_blas_thread
@@ -46,7 +46,10 @@ from .evidence.residuals import (
 from .fit import fit_samples
 from .fits.delay import Delay, delays_of, with_late_inputs
 from .fits.integrating import (
+    ACTS,
+    Direct,
     RateEvidence,
+    direct_of,
     integrated,
     integrating_flags,
     is_poorer,
@@ -54,7 +57,9 @@ from .fits.integrating import (
     rates_of,
     sums_of,
     warn_if_useless,
+    warn_of_direct,
     without_direct,
+    without_direct_terms,
 )
 from .fits.local_fit import LocalFit
 from .fits.one_fit import Samples
@@ -208,7 +213,8 @@ class SubspaceLTI(ScoredFromRest):
         Outputs with an integrator, as the position of a motor: by the columns of y or
         their positions, True for all. Their rates ``(y[k+1] - y[k]) / dt`` are
         identified in their place (`rates_`), and integrated: `lti_` has a pole at one
-        for each, beside the `order` states of the model of the rates. Where all
+        for each, beside the `order` states of the model of the rates. What inputs do
+        to these outputs at once (D) is found before, and taken from them. Where all
         outputs integrate it is fitted to these, by sums of the inputs: differences
         have more of the noise. Levels of these outputs are initial states; a constant
         rate, which `offset` finds, is that of an offset of the inputs.
@@ -720,6 +726,44 @@ class SubspaceLTI(ScoredFromRest):
         self._remember_shape(y)
         flags = integrating_flags(self.integrating, experiments[0].output_names)
         step = self._step_of(experiments)
+        names = _labels_of(X, experiments, y), _names_of(experiments, y)
+        known = experiments, flags, step, *names
+        none = Direct(np.zeros((len(flags), experiments[0].inputs.shape[1])))
+        found = none
+        if self.input_delay == 0:
+            found = direct_of(experiments, flags, self.feedthrough) or none
+        if found.sure:
+            self._integrate(*known, found)
+            return self
+        other = copy(self)
+        with collected() as told:
+            self._integrate(*known, none)
+        with collected() as of_other:
+            other._integrate(*known, found)
+
+        def error(model: Self) -> float:
+            left = np.asarray(y) - model.predict_with_initial_state(X, y)
+            return float(np.nansum(np.square(left, dtype=float)))
+
+        acts = error(other) < ACTS * error(self)
+        if acts:
+            self.__dict__.update(other.__dict__)
+        if acts or flags.all():  # of others a controller is told of
+            warn_of_direct(acts)
+        repeat(of_other if acts else told)
+        return self
+
+    def _integrate(
+        self,
+        experiments: list[Experiment],
+        flags: NDArray[np.bool_],
+        step: float | Literal[True],
+        labels: tuple[Any, Any],
+        names: tuple[Any, Any],
+        known: Direct,
+    ) -> None:
+        """Identify the rates, and integrate them; what acts at once is `known`."""
+        given, experiments = experiments, without_direct_terms(experiments, known.D)
         moved = rates_of(experiments, flags, float(step))
         table, rates = as_table(moved)
         direct = self.feedthrough
@@ -727,17 +771,15 @@ class SubspaceLTI(ScoredFromRest):
             direct = not without_direct(experiments, moved)
         options = options_of_rates(table, flags, direct, step)
         rate_model = clone(self).set_params(**options)
-        self.rates_ = inner = rate_model._fit_table(
-            table, rates, names=_labels_of(X, experiments, y)
-        )
+        self.rates_ = inner = rate_model._fit_table(table, rates, names=labels)
         best = inner
         if flags.all() and inner.method_ != "pbsid":
             best = self._of_sums(experiments, inner)
         warn_if_useless(best.residual_, of_rates=best is inner)
-        self.lti_: StateSpace = integrated(best.lti_, flags)
-        self._name(*_names_of(experiments, y))
+        self.lti_: StateSpace = integrated(best.lti_, flags, known.D)
+        self._name(*names)
         around = [model for pair in best.deviated_models() for model in pair]
-        self._evidence: Any = RateEvidence(around, flags, self.lti_.n_inputs)
+        self._evidence: Any = RateEvidence(around, flags, self.lti_.n_inputs, known.std)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
         self.selection_, self.residual_ = inner.selection_, inner.residual_
@@ -746,8 +788,7 @@ class SubspaceLTI(ScoredFromRest):
         self.offset_ = inner.offset_
         offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
         self._take_offsets(offsets, step)
-        self._take_beginning(experiments)
-        return self
+        self._take_beginning(given)
 
     def _of_sums(self, experiments: Sequence[Experiment], rates: Self) -> Self:
         """The model of the rates from the outputs themselves, by sums of the inputs.

@@ -318,13 +318,15 @@ def test_local_models_come_back_to_the_bit(options, fitted, tmp_path):
             other.poles_std_  # noqa: B018
 
 
-def test_models_of_integrating_outputs_come_back_to_the_bit(tmp_path):
+@pytest.mark.parametrize("at_once", [0.0, 2.0])
+def test_models_of_integrating_outputs_come_back_to_the_bit(tmp_path, at_once):
     u = prbs(400, clock=3, random_state=0)
     rate = StateSpace(0.8, 0.2, 1.0, sampling_time=0.1)
     noise = 1e-3 * np.random.default_rng(0).standard_normal((400, 1))
-    y = np.cumsum(rate.simulate(u), axis=0) + noise
+    y = np.cumsum(rate.simulate(u), axis=0) + at_once * u + noise
     model = SubspaceLTI(1, integrating=True, sampling_time=0.1).fit(u, y)
     other = there_and_back(model, tmp_path / "model.zip")
+    assert model.lti_.D.any() == bool(at_once)
     assert_same(model, other)
     assert_same(model.predict(u), other.predict(u))
     assert_same(model.deviated_models(), other.deviated_models())

@@ -18,6 +18,7 @@ from lpvlearn import (
 )
 from lpvlearn.models.statespace import DEVIATION
 from lpvlearn.pipeline.points.local_models import _integrating_outputs
+from lpvlearn.subspace.fits.integrating import integrated
 
 STEP = 0.02
 SERVO = GrayBoxStructure.from_template(
@@ -272,6 +273,54 @@ def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
         warnings.simplefilter("always")
         SubspaceLTI(integrating=True).fit(u, y)
     assert not any("drops out" in str(one.message) for one in caught)
+
+
+def battery(u, noise, seed=99):
+    """Voltages of a battery: its charge, a relaxation, and a resistance."""
+    cells = StateSpace([[-0.07, 0], [0, 0]], [[1 / 800], [7e-5]], [[1, 1]], [[0.0136]])
+    y = cells.simulate(u, sampling_time=1.0)
+    return y + noise * np.random.default_rng(seed).standard_normal(y.shape)
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-4])
+def test_what_acts_at_once_on_an_output_that_integrates_is_none_of_its_rate(noise):
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.choice([-3.0, 0.0, 3.0], 100), 15)[:, None]
+    y = battery(u, noise)
+    model = SubspaceLTI(sampling_time=1.0, integrating=True).fit(u, y)
+    assert model.method_ == "po-moesp"
+    np.testing.assert_allclose(model.lti_.D, 0.0136, rtol=1e-9 if noise == 0 else 5e-3)
+    truth = battery(u, 0.0)
+    assert bft_score(truth, model.predict(u)) > (99.9 if noise == 0 else 97.0)
+    flags, none = np.array([True]), np.zeros((1, 1))
+    assert integrated(model.rates_.lti_, flags, none).D == 0.0
+
+
+@pytest.mark.slow
+def test_deviations_of_a_battery_are_those_of_its_resistance_as_well():
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.choice([-3.0, 0.0, 3.0], 60), 10)[:, None]
+    found, std = [], []
+    for seed in range(30):
+        y = battery(u, 2e-3, seed)
+        model = SubspaceLTI(1, sampling_time=1.0, integrating=True).fit(u, y)
+        found.append(model.lti_.D.item())
+        pairs = model.deviated_models()
+        steps = [(a.D - b.D).item() / (2 * DEVIATION) for a, b in pairs]
+        std.append(np.linalg.norm(steps))
+    assert 0.7 < np.std(found) / np.mean(std) < 1.4
+    assert abs(np.mean(found) - 0.0136) < 4 * np.std(found) / np.sqrt(30)
+
+
+def test_a_resistance_that_may_be_a_controller_is_told():
+    u = 3.0 * np.random.default_rng(0).standard_normal((1500, 1))
+    y = battery(u, 5e-4)
+    options = {"sampling_time": 1.0, "integrating": True}
+    with pytest.warns(UserWarning, match="The former was taken.*feedthrough"):
+        model = SubspaceLTI(**options).fit(u, y)
+    np.testing.assert_allclose(model.lti_.D, 0.0136, rtol=5e-3)
+    said = SubspaceLTI(**options, feedthrough=[[True]]).fit(u, y)
+    np.testing.assert_allclose(said.lti_.D, 0.0136, rtol=5e-3)
 
 
 @pytest.mark.slow

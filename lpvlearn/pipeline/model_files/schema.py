@@ -191,6 +191,7 @@ FORMS: dict[type, dict[str, str]] = {
         "models": "StateSpace[n_inputs, n_outputs]*",
         "flags": "bool[n_outputs]",
         "n_inputs": "size[n_inputs]",
+        "direct_std": "float[n_outputs, n_inputs]?",
     },
     SubspaceLTI: {
         "lti_": "StateSpace[order, n_inputs, n_outputs]",

@@ -145,6 +145,11 @@ class Feedback(NamedTuple):
         return line and self.p_instantaneous < _AT_ONCE and not self.cut_off
 
     @property
+    def acts_at_once(self) -> bool:
+        """Whether an input surely acts within the sample, and answers no output."""
+        return self.foreseen or (self.p_answer < _REFUTED and self.p_direct > _LIKELY)
+
+    @property
     def instantaneous(self) -> bool:
         """Whether an output knows an input of the same sample: or the other way."""
         return self.p_instantaneous < _INSTANTANEOUS
@@ -270,6 +275,28 @@ def regression_of(records: Sequence[Record]) -> Regression | None:
     """The VARX of samples, of as long a past as they need; None for too few."""
     whole = _Past.of(records, 0)
     return None if whole is None else _coefficients(whole)
+
+
+def direct_terms(records: Sequence[Record]) -> tuple[Array, Array] | None:
+    """D of the VARX of samples, and its standard deviations.
+
+    None for too few samples, or inputs that follow from the past.
+    """
+    whole = _Past.of(records, 0)
+    if whole is None:
+        return None
+    m, ny = len(whole.records[0].u), len(whole.records[0].y)
+    rows = whole.present[: m + ny]
+    past = _basis(whole.before, whole.before, _DEPENDENT)
+    left = rows - (rows @ past) @ past.T
+    known = _basis(left[:m], rows[:m], _FORESEEN)
+    if known.shape[1] < m:
+        return None
+    D = scaled_lstsq(left[:m].T, left[m:].T, _DEPENDENT)[0].T
+    noise = np.sum((left[m:] - D @ left[:m]) ** 2, axis=1)
+    noise /= max(whole.n_windows - past.shape[1] - m, 1)
+    spread = np.diag(np.linalg.inv(left[:m] @ left[:m].T))
+    return D, np.sqrt(np.outer(noise, spread))
 
 
 class _Past(NamedTuple):

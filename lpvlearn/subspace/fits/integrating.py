@@ -3,24 +3,26 @@
 An integrator is a pole at one that no record tells from a slow one. The rates of the
 outputs ``(y[k+1] - y[k]) / dt`` do not have it: their model, with a feedthrough from
 the inputs of the step, is stable, and behind ``y[k+1] = y[k] + dt rate[k]`` it is that
-of the outputs, exactly.
+of the outputs, exactly. What inputs do to such an output at once, as the current to the
+voltage of a battery, is none of its rate, which would know the next sample: that is
+taken from the outputs before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ...data.experiments import Experiment
 from ...exceptions import warn
-from ...models.statespace import ModelPair, StateSpace
+from ...models.statespace import DEVIATION, ModelPair, StateSpace
 from ...validation import has_one_axis, is_whole, shown
-from ..closed_loop.varx import Feedback, find_feedback
+from ..closed_loop.varx import Feedback, direct_terms, find_feedback
 from ..evidence.constants import USELESS
 from ..evidence.statistics import Evidence
 from ..samples.records import scale_records
@@ -29,6 +31,12 @@ from .options import feedthrough_mask
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_SEEN = 5.0  # standard deviations of an entry of D that is none by chance
+
+# Share of the squared errors that D must leave where it may be that of a controller,
+# which tells of the noise alone.
+ACTS = 0.5
 
 _WORSE = 1.05  # of squared errors: those that are whitened are the least, not these
 
@@ -57,6 +65,59 @@ def integrating_flags(integrating: Any, names: Sequence[Any]) -> Flags:
             )
         flags[place] = True
     return flags
+
+
+class Direct(NamedTuple):
+    """What inputs do at once to the outputs that integrate."""
+
+    D: Array  # (n_outputs, n_inputs)
+    std: Array | None = None  # of its entries; None where they are zero
+    sure: bool = True  # or a controller may answer outputs within the sample
+
+
+def direct_of(
+    experiments: Sequence[Experiment], flags: Flags, feedthrough: Any
+) -> Direct | None:
+    """What acts at once by a regression of the outputs on their past; None if nothing.
+
+    Gaussian signals do not tell it from what a controller answers: surer is a
+    `feedthrough` that is a table.
+    """
+    n_inputs = experiments[0].inputs.shape[1]
+    allowed = feedthrough_mask(feedthrough, len(flags), n_inputs, n_inputs)
+    allowed = allowed & flags[:, None]
+    scaled = scale_records([(e.inputs, e.measured) for e in experiments])
+    found = direct_terms(scaled.records) if allowed.any() else None
+    if found is None:
+        return None
+    size = np.outer(scaled.output_scale, 1.0 / scaled.input_scale)
+    D, std = (size * x for x in found)
+    seen = allowed & (np.abs(D) > _SEEN * std)
+    feedback = find_feedback(scaled.records) if seen.any() else None
+    if feedback is None or feedback.found:
+        return None
+    sure = not isinstance(feedthrough, bool) or feedback.acts_at_once
+    return Direct(np.where(seen, D, 0.0), np.where(seen, std, 0.0), sure)
+
+
+def warn_of_direct(acts: bool) -> None:
+    """Tell how it was taken that outputs that integrate follow inputs at once."""
+    taken = "The latter was taken, with D = 0"
+    if acts:
+        taken = "The former was taken, which explains far more"
+    warn(
+        "Outputs that integrate follow inputs of the same sample. These may act at "
+        "once, as a current on the voltage of a battery, or a controller that makes "
+        f"them may answer at once. {taken}. Use `feedthrough`, a table of True "
+        "and False, to say which."
+    )
+
+
+def without_direct_terms(
+    experiments: Sequence[Experiment], D: Array
+) -> list[Experiment]:
+    """The experiments without what their inputs do to their outputs at once."""
+    return [replace(e, outputs=e.measured - e.inputs @ D.T) for e in experiments]
 
 
 def rates_of(
@@ -147,8 +208,10 @@ def options_of_rates(
     }
 
 
-def integrated(model: StateSpace, flags: Flags) -> StateSpace:
+def integrated(model: StateSpace, flags: Flags, direct: ArrayLike = 0.0) -> StateSpace:
     """The model of the outputs from that of the rates of some of them.
+
+    `direct` (n_outputs, n_inputs) is what these have of D.
 
     >>> rate = StateSpace(0.5, 1.0, 1.0, 0.2, sampling_time=1.0)
     >>> integrated(rate, np.array([True])).poles()
@@ -160,7 +223,7 @@ def integrated(model: StateSpace, flags: Flags) -> StateSpace:
     B = np.vstack([model.B, dt * E @ model.D])
     own = ~flags[:, None]
     C = np.hstack([np.where(own, model.C, 0.0), E.T])
-    D = np.where(own, model.D, 0.0)
+    D = np.where(own, model.D, direct)
     return StateSpace(A, B, C, D, model.sampling_time, input_delay=model.input_delay)
 
 
@@ -209,6 +272,8 @@ class RateEvidence:
     models: list[StateSpace]  # of the rates, to either side: above, below, above, ...
     flags: Flags  # (n_outputs,): which of them integrate
     n_inputs: int
+    # (n_outputs, n_inputs): of D of the outputs that integrate; None where it is zero
+    direct_std: Array | None = None
 
     @property
     def free(self) -> Freedom:
@@ -217,7 +282,15 @@ class RateEvidence:
 
     def deviated_models(self, lti: StateSpace) -> list[ModelPair]:
         """Models to either side, with the integrators."""
-        moved = [integrated(model, self.flags) for model in self.models]
+        moved = [integrated(model, self.flags, lti.D) for model in self.models]
+        std = np.zeros_like(lti.D) if self.direct_std is None else self.direct_std
+        for i, j in np.argwhere(std) if moved else ():
+            step = np.zeros_like(lti.D)
+            step[i, j] = DEVIATION * std[i, j]
+            moved += [
+                StateSpace(lti.A, lti.B, lti.C, D, lti.sampling_time, lti.input_delay)
+                for D in (lti.D + step, lti.D - step)
+            ]
         return list(zip(moved[::2], moved[1::2], strict=True))
 
     @property
