@@ -79,10 +79,6 @@ _INTEGRATOR = (
 _AT_BOUND = 1e-6  # relative distance to a bound that holds a parameter
 _MOST_STARTS = 100_000  # all are drawn at once
 
-# A fit of an error up to that multiple of the black box's standard deviation is as good
-# as the true parameters' own.
-_NOISY = 1.5
-
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
@@ -373,8 +369,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         if len(realizations):
             problem.check_realizations(realizations)
-        known = problem.uncertainty(realizations, estimates)
-        at = self._restructure(problem, given, estimates, known, only_given=not search)
+        problem = problem.with_deviations(realizations, estimates)
+        at = self._restructure(problem, given, estimates, only_given=not search)
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif len(realizations):
@@ -467,7 +463,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "`sample_weight` must be None with norm='covariance', which weighs the "
                 "error by its `noise`: put a larger one where the response is doubted."
             )
-        at = self._restructure(problem, [], uncertainty=problem.uncertainty([], []))
+        at = self._restructure(problem.with_deviations([], []), [])
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif problem.noise is not None:
@@ -664,7 +660,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         problem: RestructuringProblem,
         given: list[Array],
         estimates: Sequence[Estimate] = (),
-        uncertainty: float = 0.0,
         only_given: bool = False,
     ) -> ParameterUncertainty:
         """Starts and their least-squares fits, minimisation, certificates, warnings.
@@ -676,12 +671,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         rule = "be a whole number from 0 to 2**32 - 1, or None"
         with naming_argument("random_state", rule, self.random_state):
             seed = check_random_state(self.random_state).randint(2**31)
-        enough = max(EXACT_FIT, _NOISY * uncertainty)
         seconds = np.inf if self.max_time is None else float(self.max_time)
         with bounded(seconds):
             with bounded(_SEARCH_SHARE * seconds):
                 found = starts_of(
-                    problem, self.init, self.n_starts, given, seed, only_given, enough
+                    problem, self.init, self.n_starts, given, seed, only_given
                 )
                 hurried = time_is_up()
             problem, fits = found.problem, found.fits
@@ -698,7 +692,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.identifiability_ = at.identifiability()
             guessed = not isinstance(self.init, str) or only_given
             doubted = not (guessed or found.certain)
-            self._warn(problem, result, enough, doubted, hurried, settled)
+            self._warn(problem, result, doubted, hurried, settled)
         return at
 
     def _tell_of_others(self, problem: RestructuringProblem) -> None:
@@ -883,7 +877,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self,
         problem: RestructuringProblem,
         result: MinimaxResult,
-        enough: float,
         doubted: bool,
         hurried: bool,
         settled: bool,
@@ -896,7 +889,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         norm stopped before them; those of a wrong basin noise would not explain.
         """
         errors = self.starts_["relative_error"].to_numpy()
-        timed_out = hurried and errors[0] > enough
+        timed_out = hurried and errors[0] > problem.enough
         if timed_out or (time_is_up() and not result.converged):
             warn(
                 "the search ended at `max_time`, with a relative error of "
@@ -941,7 +934,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         floor = self.structural_floor_ / problem.reference
         explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
         error = min(self.fit_error_, self.relative_error_) - floor
-        if error > max(_POOR_FIT, enough) and not explained:
+        if error > max(_POOR_FIT, problem.enough) and not explained:
             warn(
                 f"the structure comes no nearer than {100 * self.fit_error_:.2g} % "
                 f"(root mean square over frequency) to the black box; {together} of "

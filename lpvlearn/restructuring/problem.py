@@ -8,7 +8,7 @@ other, or a measured frequency response.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -60,6 +60,10 @@ _SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it i
 # a rate that no response down to the lowest frequency could show.
 _LEAST_DECAY = 1e-4
 
+# A fit of an error up to that multiple of the black box's standard deviation is as good
+# as the true parameters' own.
+_NOISY = 1.5
+
 _SAME = 1e-6  # relative difference of delays that is rounding
 
 _MOST_WEIGHTED = 1e60  # size of a weighted response: fourth powers of it are numbers
@@ -83,6 +87,8 @@ class RestructuringProblem:
     division: Division | None = None
     noise: Array | None = None  # standard deviations of the entries of a response
     lacks_poles: bool = False  # whether a black box has not the poles of the structure
+    # of every output of the black box, relative to the root mean square of all
+    deviations: Array | float = 0.0
 
     @cached_property
     def response(self) -> Complex:
@@ -127,12 +133,25 @@ class RestructuringProblem:
         units = _UNITS * self.system.rounding(theta) / self.reference
         return min(units, _MOST_ROUNDING)
 
-    def is_exact(self, fit: LeastSquaresResult, enough: float) -> bool:
-        """Whether nothing is better: an error of at most `enough`, or of rounding."""
+    @property
+    def enough(self) -> float:
+        """Relative error of a fit as good as the true parameters' own."""
+        return max(EXACT_FIT, _NOISY * float(np.linalg.norm(self.deviations)))
+
+    def is_exact(self, fit: LeastSquaresResult) -> bool:
+        """Whether nothing is better: an error of the black box itself, or of rounding.
+
+        Of every output: beside one of large numbers another's error may be all of it.
+        """
         error = fit.relative_error
-        if not enough < error <= _MOST_ROUNDING:
-            return error <= enough
-        return error <= self.rounding(fit.x)
+        if error <= EXACT_FIT:
+            return True
+        if error <= self.enough:
+            left = self.system.response(fit.x, self.omega) - self.response
+            squares = np.sum(np.abs(self.weight @ left) ** 2, axis=(0, 2))
+            errors = np.sqrt(squares / len(self.omega)) / self._weighted[1]
+            return bool((errors <= _NOISY * self.deviations + EXACT_FIT).all())
+        return error <= _MOST_ROUNDING and error <= self.rounding(fit.x)
 
     def _locally(self, fit: LeastSquaresResult) -> LeastSquaresResult:
         """A fit of a canonical form, ended in coordinates of the models near it.
@@ -178,14 +197,13 @@ class RestructuringProblem:
         self,
         candidates: Array,
         n_fits: int,
-        enough: float = EXACT_FIT,
         known: Sequence[LeastSquaresResult] = (),
     ) -> list[LeastSquaresResult]:
         """Least-squares fits from the best candidates, until one is certain.
 
-        That is one of a relative error of at most `enough`, or a good one at which
-        several end, `known` ones among them, which as many more may look for. They are
-        ranked by the error of their response, not of their parameters.
+        That is one that is exact (`is_exact`), or a good one at which several end,
+        `known` ones among them, which as many more may look for. They are ranked by the
+        error of their response, not of their parameters.
         """
         system = self.system
         usable = [theta for theta in candidates if self.is_stable(theta)]
@@ -203,7 +221,7 @@ class RestructuringProblem:
             together = agreeing([*known, *fits])
             if best <= GOOD_FIT and together >= AGREEING:
                 break
-            if any(self.is_exact(fit, enough) for fit in fits):
+            if any(map(self.is_exact, fits)):
                 break
             if best > GOOD_FIT and number >= n_fits:
                 break
@@ -234,29 +252,30 @@ class RestructuringProblem:
                     f"{model} at place {number}."
                 )
 
-    def uncertainty(
+    def with_deviations(
         self, realizations: Sequence[StateSpace], estimates: Sequence[Any]
-    ) -> float:
-        """Standard deviation of the response, relative, as errors of `fit` are.
+    ) -> RestructuringProblem:
+        """The same whose `deviations` of the response are known.
 
         From the noise of a response, the spread of realizations that the black box is
         the mean of, or models at either side of independent estimates; else zero.
         """
-        squares = 0.0
+        squares: Array | float = 0.0
         if self.noise is not None:
-            squares = float(np.sum(np.abs(self.weight) ** 2 @ self.noise**2))
+            squares = np.sum(np.abs(self.weight) ** 2 @ self.noise**2, axis=(0, 2))
         elif estimates:
             count = len(estimates)
             pairs = [pair for _, both in estimates for pair in both]
             steps = [self._weighted_response(a) - self._weighted_response(b)
                      for a, b in pairs]  # fmt: skip
             scale = 2.0 * DEVIATION * count
-            squares = sum(float(np.sum(np.abs(d / scale) ** 2)) for d in steps)
+            squares = sum(np.sum(np.abs(d / scale) ** 2, axis=(0, 2)) for d in steps)
         elif len(realizations) > 1:
             G = np.array([self._weighted_response(model) for model in realizations])
-            variance = np.sum(np.abs(G - G.mean(0)) ** 2) / (len(G) - 1)
-            squares = float(variance) / len(G)
-        return float(np.sqrt(squares / len(self.omega))) / self._weighted[1]
+            variance = np.sum(np.abs(G - G.mean(0)) ** 2, axis=(0, 1, 3)) / (len(G) - 1)
+            squares = variance / len(G)
+        deviations = np.sqrt(squares / len(self.omega)) / self._weighted[1]
+        return replace(self, deviations=deviations)
 
     def response_of(self, model: StateSpace) -> Complex:
         """Response of a model at the frequencies, as the black box is compared.

@@ -29,7 +29,7 @@ from .error_system import Target, frequency_grid, model_response
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
 from .parts import start_by_parts
-from .problem import AGREEING, EXACT_FIT, RestructuringProblem, agreeing
+from .problem import AGREEING, RestructuringProblem, agreeing
 from .similarity import mean_rate, scaled_problem, similarity_starts
 
 Array = NDArray[np.float64]
@@ -101,14 +101,12 @@ def search(
     given: list[Array],
     seed: int,
     only_given: bool = False,
-    enough: float = EXACT_FIT,
 ) -> Search:
     """Least-squares fits from many starts, or only from `given` ones.
 
     Where no model of the structure decays as fast as the black box lets expect, its
     stability margin is given up. The options are those of `GrayBoxRestructurer`;
-    further candidates may be `given`, or all of them. A relative error of at most
-    `enough` is the black box's own.
+    further candidates may be `given`, or all of them.
     """
     guess = None
     if not isinstance(init, str):
@@ -121,7 +119,7 @@ def search(
             fits, certain = sorted(found, key=_COST), False
         else:
             rng = np.random.default_rng(seed)
-            fits, certain = _rounds(problem, guess, n_starts, given, rng, enough)
+            fits, certain = _rounds(problem, guess, n_starts, given, rng)
         if fits:
             return Search(problem, fits, certain)
     silent = _without_effect(problem, np.random.default_rng(seed))
@@ -142,7 +140,7 @@ def search(
     if guess is None and not only_given:
         rng = np.random.default_rng(seed)
         drawn = list(_natural_starts(problem, n_starts, rng))
-        fits, certain = _rounds(problem, guess, n_starts, drawn, rng, enough)
+        fits, certain = _rounds(problem, guess, n_starts, drawn, rng)
         if fits:
             return Search(problem, fits, certain)
     begun = given if only_given else [guess]
@@ -219,11 +217,10 @@ def _rounds(
     n_starts: int,
     given: list[Array],
     rng: np.random.Generator,
-    enough: float,
 ) -> tuple[list[LeastSquaresResult], bool]:
     """Rounds of candidates and fits, until two agree, and whether they do.
 
-    One fit of a relative error of `enough` needs no other. Starts of one round have
+    One fit that is exact needs no other. Starts of one round have
     much in common, which may mislead all of them.
     """
     structure, n_fits = problem.structure, _N_FITS + len(given)
@@ -244,17 +241,17 @@ def _rounds(
         if len(new) == 0:
             break
         tried = np.vstack([tried, new])
-        more = problem.best_fits(new, n_fits, enough, ends)
+        more = problem.best_fits(new, n_fits, ends)
         ends += sorted(more, key=_COST)[:1]
         fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        exact = bool(fits) and problem.is_exact(fits[0], enough)
+        exact = bool(fits) and problem.is_exact(fits[0])
         certain = linear or exact or agreeing(ends) >= AGREEING
-        if certain and best <= max(_FAR_FIT, enough) or (fits and time_is_up()):
+        if certain and best <= max(_FAR_FIT, problem.enough) or (fits and time_is_up()):
             break
     if fits and best > _HOP_FIT:
         fits = hopped_fits(problem, fits, rng)
-        exact = problem.is_exact(fits[0], enough)
+        exact = problem.is_exact(fits[0])
         certain = certain or exact or agreeing(fits) >= AGREEING
     return fits, certain
 

@@ -1,5 +1,7 @@
 """What is matched, behind weights."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -118,12 +120,28 @@ def test_the_uncertainty_is_the_spread_of_the_response():
     step = DEVIATION * std
     pairs = [(gain.model([2.0, 3.0 + step]), gain.model([2.0, 3.0 - step]))]
     problem = problem_from_models(gain, [box], None)
-    assert np.isclose(problem.uncertainty([], [(box, pairs)]), std / 3.0)
-    half = problem.uncertainty([], [(box, pairs)] * 4)
-    assert np.isclose(half, std / 3.0 / 2.0)
+
+    def deviations(*known):
+        return problem.with_deviations(*known).deviations
+
+    assert np.isclose(deviations([], [(box, pairs)]), std / 3.0)
+    assert np.isclose(deviations([], [(box, pairs)] * 4), std / 3.0 / 2.0)
     runs = [gain.model([2.0, 3.0 + d]) for d in (-0.1, 0.0, 0.1)]
-    assert np.isclose(problem.uncertainty(runs, []), 0.1 / np.sqrt(3) / 3.0)
-    assert problem.uncertainty([box], []) == 0.0
+    assert np.isclose(deviations(runs, []), 0.1 / np.sqrt(3) / 3.0)
+    assert deviations([box], []) == 0.0
+
+
+def test_an_output_of_small_numbers_must_be_met_as_well():
+    lags = GrayBoxStructure.from_template(
+        [["-a", 0], [0, "-b"]], [["c"], ["d"]], [[1, 0], [0, 1]]
+    )
+    box, exact = lags.model([1.0, 2.0, 1e3, 2e-3]), [1.0, 2.0, 1e3, 2e-3]
+    runs = [lags.model([1.0, 2.0, 1e3 * x, 2e-3 * x]) for x in (0.98, 1.0, 1.02)]
+    problem = problem_from_models(lags, [box], None).with_deviations(runs, [])
+    fit = problem.fit(np.array(exact))._replace(relative_error=1e-3)
+    assert problem.is_exact(fit)
+    off = fit._replace(x=np.array([1.0, 2.0, 1e3, -2e-3]))  # a millionth of all
+    assert not problem.is_exact(off)
 
 
 def test_fits_end_where_two_agree_or_the_error_is_the_black_boxs_own():
@@ -138,7 +156,8 @@ def test_fits_end_where_two_agree_or_the_error_is_the_black_boxs_own():
     fits = problem.best_fits(starts, 3)
     assert 1e-8 < fits[0].relative_error < 3e-3
     assert len(fits) == agreeing(fits) == 2
-    assert len(problem.best_fits(starts, 3, enough=3e-3)) == 1
+    known = replace(problem, deviations=np.array([2e-3]))
+    assert len(known.best_fits(starts, 3)) == 1
 
 
 def test_a_fit_that_no_other_round_confirms_is_told(monkeypatch):
