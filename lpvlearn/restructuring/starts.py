@@ -278,7 +278,7 @@ def hopped_fits(
     it.
     """
     lower, upper = problem.structure.lower, problem.structure.upper
-    for j in np.flatnonzero(~has_sign(problem.structure))[:_MOST_SIGNS]:
+    for j in np.flatnonzero(known_signs(problem.structure) == 0.0)[:_MOST_SIGNS]:
         if time_is_up():
             break
         theta = fits[0].x.copy()
@@ -533,12 +533,12 @@ def continuation_candidates(
     if box is None or len(box.A) == 0:
         return nothing
     count = _N_CONTINUED if thorough else _N_QUICK
-    signed, upper = has_sign(structure), structure.upper
+    sign = known_signs(structure)
+    signed = sign != 0.0
     rows = [nothing if structure.initial is None else structure.initial[None]]
     equations = structure.implicit is not None
     physical = seeds[(seeds > 0).all(1)][:count] if equations else nothing
     if isinstance(structure.map, AffineMap) and (thorough or signed.any()):
-        sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
         S, basis = structure.map.offset, structure.map.basis
         drawn = _natural_sizes(box, S, basis, structure.order, count, rng)
         physical = drawn * np.where(sign == 0, 1.0, sign)
@@ -556,10 +556,12 @@ def continuation_candidates(
     return np.vstack(found)
 
 
-def has_sign(structure: GrayBoxStructure) -> NDArray[np.bool_]:
-    """Parameters whose bounds or ranges tell their sign, (n_params,)."""
+def known_signs(structure: GrayBoxStructure) -> Array:
+    """Signs that bounds or ranges tell, (n_params,): -1 or 1; 0 where nothing does."""
     lower, upper, ranges = structure.lower, structure.upper, structure.ranges
-    return (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
+    known = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
+    below = (upper <= 0) | (ranges[0] < 0)
+    return np.where(known, np.where(below, -1.0, 1.0), 0.0)
 
 
 def _natural_starts(
@@ -579,8 +581,8 @@ def _natural_starts(
     drawn = _natural_sizes(box, S, basis, n, count, rng)
     free = rng.choice([-1.0, 1.0], drawn.shape)
     free[::2] = 1.0
-    below = (structure.upper <= 0) | (structure.ranges[0] < 0)
-    return drawn * np.where(has_sign(structure), np.where(below, -1.0, 1.0), free)
+    sign = known_signs(structure)
+    return drawn * np.where(sign == 0.0, free, sign)
 
 
 def _natural_sizes(

@@ -333,3 +333,20 @@ def test_equations_in_any_units_are_found_from_nothing():
             )
             expected = [truth[name] for name in structure.parameter_names]
             assert_allclose(found.params_, expected, rtol=1e-6)
+
+
+def test_signs_that_ranges_tell_are_kept_where_a_search_is_carried_on():
+    ranges = {"k": (-500, -1), "c": (-3, -0.1), "q": (-50, -1), "b": (0.1, 10)}
+    structure = GrayBoxStructure.from_template(
+        A=[[0, 1, 0], ["k", "c", "g"], [0, "h", "q"]],
+        B=[[0], ["b"], [0]],
+        C=[[1, 0, 0]],
+    ).with_ranges(ranges | {"h": (-9, -0.1), "g": (0.1, 9)})
+    truth = {"k": -40.0, "c": -0.5, "b": 2.0, "g": 3.0, "h": -2.0, "q": -10.0}
+    box = target_of(structure.model(truth))
+    signs = [np.sign(truth[name]) for name in structure.parameter_names]
+    for thorough in (False, True):
+        found = continuation_candidates(
+            structure, box, np.zeros((0, 6)), np.random.default_rng(0), thorough
+        )
+        assert len(found) and (np.sign(found) == signs).all()
