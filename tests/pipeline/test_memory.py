@@ -4,6 +4,7 @@ import importlib
 import itertools
 import pickle
 import sys
+import warnings
 from functools import partial
 from types import SimpleNamespace
 
@@ -16,9 +17,12 @@ from joblib import Memory
 from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
+    LocalLPVPipeline,
     PolynomialLPV,
     SubspaceLTI,
+    from_trajectories,
 )
+from lpvlearn.exceptions import warn
 from lpvlearn.pipeline.running.memory import fingerprint
 from lpvlearn.pipeline.running.runner import PointRunner
 
@@ -93,10 +97,56 @@ def test_an_object_with_the_interface_of_a_memory_serves(calls):
     results = {}
 
     def cache(function, ignore=None):
-        return lambda x: results.setdefault(x, function(x))
+        return lambda x: (
+            results[x] if x in results else results.setdefault(x, function(x))
+        )
 
-    assert runner(SimpleNamespace(cache=cache)).call(square, 4) == 16
-    assert results == {4: 16}
+    for _ in range(2):
+        assert runner(SimpleNamespace(cache=cache)).call(square, 4) == 16
+        with pytest.warns(UserWarning, match="Square -1"):
+            assert runner(SimpleNamespace(cache=cache)).call(told_square, -1) == 1
+    assert calls == [4, -1]
+
+
+def told_square(x):
+    warn(f"Square {x} instead.")
+    return square(x)
+
+
+def test_what_was_told_comes_with_what_is_kept(tmp_path, calls):
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="Square 3 instead"):
+            assert runner(Memory(tmp_path, verbose=0)).call(told_square, 3) == 9
+    assert calls == [3]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restructurer", ["passthrough", None])
+def test_the_second_fit_is_the_first_one(tmp_path, restructurer):
+    """Inputs come late, which the chain finds by what its models told."""
+    rng = np.random.default_rng(0)
+    spring, runs = spring_structure(), []
+    for kappa in (0.0, 0.5, 1.0, 1.5, 2.0):
+        u = np.repeat(np.sign(rng.standard_normal((300, 1))), 2, axis=0)
+        late = np.vstack([np.zeros((3, 1)), u[:-3]])
+        plant = spring.model({"k": 4.0 + kappa**2, "c": 1.0, "b": 1.0})
+        y = plant.simulate(late, sampling_time=0.1)
+        runs.append((u, kappa, y + 0.01 * y.std() * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=0.1)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    restructurer = restructurer or GrayBoxRestructurer(spring)
+    fits = []
+    for memory in (None, tmp_path, tmp_path):
+        pipeline = LocalLPVPipeline(restructurer=restructurer, memory=memory, **roles)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            pipeline.fit(X, y)
+        fits.append((pipeline, [str(one.message) for one in told]))
+    for pipeline, told in fits:
+        np.testing.assert_array_equal(pipeline.input_delay_, [3])
+        assert told == fits[0][1]
+        assert pipeline.warnings_ == fits[0][0].warnings_
+        pd.testing.assert_frame_equal(pipeline.report_, fits[0][0].report_)
 
 
 def test_slow_writing_of_the_memory_is_not_told_to_the_user(tmp_path, monkeypatch):

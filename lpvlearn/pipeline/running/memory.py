@@ -16,7 +16,7 @@ import sys
 import sysconfig
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ import scipy
 from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
-from ...exceptions import LIBRARY, warn
+from ...exceptions import LIBRARY, Told, collected, repeat, retold, warn
 from ...systems.whole_files import unwritten as unwritten  # the command says it, too
 from ...validation import shown
 
@@ -63,8 +63,9 @@ def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
 class Remembered:
     """A function whose results a store keeps by all that they depend on.
 
-    What ``joblib.Memory.cache`` does, without its record of the arguments as text:
-    joblib warns the user where writing that took long, as under load it may.
+    And what is told on the way, as choices may hang on it. What ``joblib.Memory.cache``
+    does, without its record of the arguments as text: joblib warns the user where
+    writing that took long, as under load it may.
     """
 
     function: Callable[..., Any]  # at the top of a module
@@ -76,9 +77,9 @@ class Remembered:
         if self.store is None:
             return self.function(*args, **kwargs)
         named = inspect.signature(self.function).bind(*args, **kwargs).arguments
-        told = {name: v for name, v in named.items() if name not in self.ignore}
+        known = {name: v for name, v in named.items() if name not in self.ignore}
         try:
-            key = fingerprint(told)
+            key = fingerprint(known)
         except _Unknown as cause:
             warn(
                 f"`memory` keeps no result that depends on {cause}, of which another "
@@ -91,13 +92,15 @@ class Remembered:
         if self.store.contains_item(item):
             kept = self._kept(item)
             if kept is not None:
+                repeat(kept.told)
                 return kept.result
             warn(
                 f"`memory` holds an entry that is damaged or not its own: {folder}, "
                 f"{key}. It is computed anew and replaced."
             )
-        result = self.function(*args, **kwargs)
-        self.store.dump_item(item, _Kept(key, result), verbose=0)
+        with retold() as told:
+            result = self.function(*args, **kwargs)
+        self.store.dump_item(item, _Kept(key, result, told), verbose=0)
         if not self.store.contains_item(item):  # joblib told why
             warn(
                 f"`memory` could not keep a result in {self.store.location}: is there "
@@ -118,14 +121,39 @@ class _Kept(NamedTuple):
 
     key: str
     result: Any
+    told: list[Told]
 
     def __reduce__(self) -> tuple[Any, ...]:
         # As bytes: joblib's own way with many small arrays is slow.
-        return _kept, (self.key, pickle.dumps(self.result, pickle.HIGHEST_PROTOCOL))
+        data = pickle.dumps((self.result, self.told), pickle.HIGHEST_PROTOCOL)
+        return _kept, (self.key, data)
 
 
 def _kept(key: str, data: bytes) -> _Kept:
-    return _Kept(key, pickle.loads(data))  # nosec B301: of a folder that is trusted
+    return _Kept(key, *pickle.loads(data))  # nosec B301: of a folder that is trusted
+
+
+@dataclass(frozen=True)
+class RememberedElsewhere:
+    """The same by an object with the interface of joblib.Memory."""
+
+    memory: Any
+    function: Callable[..., Any]
+    ignore: tuple[str, ...] = ()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The result for these arguments: the one kept, else a new one."""
+        function = self.function
+
+        @wraps(function)
+        def beside_told(*args: Any, **kwargs: Any) -> tuple[Any, list[Told]]:
+            with collected() as told:
+                return function(*args, **kwargs), told
+
+        cached = self.memory.cache(beside_told, ignore=list(self.ignore))
+        result, told = cached(*args, **kwargs)
+        repeat(told)
+        return result
 
 
 class _Unknown(Exception):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...exceptions import Told, collected, warn
 from ...systems.threads import one_blas_thread
 from ...validation import number_shown
-from .memory import Remembered
+from .memory import Remembered, RememberedElsewhere
 from .workers import results_of
 
 Array = NDArray[np.float64]
@@ -138,7 +138,7 @@ class PointRunner:
         if hasattr(self.memory, "store_backend"):
             return Remembered(function, self.memory.store_backend, tuple(ignore))
         # An object with the interface of joblib.Memory: its own affair.
-        return self.memory.cache(function, ignore=list(ignore))
+        return RememberedElsewhere(self.memory, function, tuple(ignore))
 
 
 class Done(NamedTuple):
