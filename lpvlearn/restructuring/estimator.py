@@ -24,7 +24,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
-from ..models.statespace import StateSpace
+from ..models.statespace import DEVIATION, StateSpace
 from ..structures.interchanges import INTERCHANGE, exchangeable, known_before
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import PeakSet
@@ -65,7 +65,7 @@ from .problem import (
     problem_from_response,
 )
 from .similarity import minimise_bilinear
-from .starts import DISCRETE_BOX
+from .starts import DISCRETE_BOX, known_signs
 from .starts import search as starts_of
 from .uncertainty import ParameterUncertainty
 
@@ -81,6 +81,8 @@ _MOST_STARTS = 100_000  # all are drawn at once
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
+_NOTHING = 0.9  # that of a structure that explains next to nothing
+_SEEN = 5.0  # standard deviations of an entry of D that is none by chance
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 # Of the H-infinity norm's own, and of the black box: an error that is larger by both is
@@ -734,6 +736,42 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "give what is known of them (a value, or bounds)."
             )
 
+    def _tell_of_negative_masses(self) -> None:
+        """Tell of ``M(theta)``, or E, that is not positive, where nobody said so."""
+        equations, theta = self.structure_.implicit, self.params_
+        if equations is None:
+            return
+        M = equations.M[0] + np.tensordot(theta, equations.M[1:], 1)
+        free = equations.M[1:].any((1, 2)) & (known_signs(self.structure_) == 0.0)
+        negative = np.flatnonzero(free & (theta < 0.0))
+        symmetric = np.isfinite(M).all() and (M == M.T).all()
+        if not symmetric or not len(negative) or np.linalg.eigvalsh(M)[0] >= 0.0:
+            return
+        names = self.structure_.parameter_names
+        values = listed([f"{names[j]} = {theta[j]:.3g}" for j in negative], _NAMED)
+        warn(
+            f"`{equations.name}` is not positive with {values}, as no mass, inertia or "
+            "capacity is. Check the signs of the template; or give bounds that say so, "
+            "by structure.with_bounds()."
+        )
+
+    def _without_feedthrough(self, estimates: Sequence[Estimate]) -> str:
+        """Which entries of D the structure lacks, as a sentence; nothing for none."""
+        dropped = self.dropped_feedthrough_
+        pairs = [pair for _, both in estimates for pair in both]
+        if not pairs or not dropped.any():
+            return ""
+        steps = np.array([above.D - below.D for above, below in pairs])
+        std = np.linalg.norm(steps, axis=0) / (2.0 * DEVIATION * len(estimates))
+        seen = np.argwhere(np.abs(dropped) > _SEEN * std)
+        if not len(seen):
+            return ""
+        places = listed([f"D[{i}][{j}]" for i, j in seen], _NAMED)
+        return (
+            f" The black box has {places}, more than by chance, where the structure "
+            "has none."
+        )
+
     def _at_bounds(self) -> str:
         """Which parameters stand at their bounds, as a sentence; nothing for none."""
         structure, theta = self.structure_, self.params_
@@ -863,13 +901,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         if not found.is_plausible:
             warn(
-                f"the structure lies {np.sqrt(found.misfit):.1f} times as far from the "
+                f"the structure lies {np.sqrt(found.misfit):.3g} times as far from the "
                 "black box as its noise explains (`p_value_` "
                 f"{found.p_value:.1g}): the standard deviations are too small then, "
                 "and the parameters meet the frequencies best that the data tell most "
                 "of. Give the structure what it lacks, the local models the delay of "
                 "an input that answers late (`input_delay`), or keep the H-infinity "
                 "optimum by norm='hinf' (in a pipeline, efficient=False)."
+                + self._at_bounds()
+                + self._without_feedthrough(estimates)
             )
         return found.converged and found.p_value > IMPLAUSIBLE
 
@@ -932,6 +972,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
         floor = self.structural_floor_ / problem.reference
+        if (
+            self.fit_error_ > _NOTHING
+        ):  # far off no parameters move it: that is no floor
+            floor = 0.0
         explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
         error = min(self.fit_error_, self.relative_error_) - floor
         if error > max(_POOR_FIT, problem.enough) and not explained:
@@ -952,6 +996,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 * (self.structure is not None and not self.lti_.is_continuous),
                 ConvergenceWarning,
             )
+        self._tell_of_negative_masses()
         if self.identifiability_.rank < self.structure_.n_params:
             warn(str(self.identifiability_), RankWarning)
             return

@@ -404,7 +404,10 @@ def _natural_candidates(
     n_starts: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Positive parameters of physical equations of which no size is known."""
+    """Parameters of physical equations of which no size is known.
+
+    Positive where no sign is; beside negative ones half of them of any sign.
+    """
     omega, box = problem.omega, problem.box
     rate = mean_rate(omega if box is None else np.abs(np.linalg.eigvals(box.A)))
     # around the rate, up to a factor of e, the states of all equations take part
@@ -413,7 +416,11 @@ def _natural_candidates(
     G = np.abs(problem.response[near if near.any() else slice(None)])
     gains = np.sqrt(np.mean(G**2, axis=0))[: problem.structure.n_outputs]
     sizes = equations.natural_sizes(rate, gains)
-    return np.asarray(sizes * np.exp(rng.normal(size=(n_starts, len(sizes)))))
+    drawn = sizes * np.exp(rng.normal(size=(n_starts, len(sizes))))
+    sign, free = known_signs(problem.structure), np.ones(drawn.shape)
+    if (sign < 0.0).any():
+        free[1::2] = rng.choice([-1.0, 1.0], free[1::2].shape)
+    return np.where(sign == 0.0, free, sign) * drawn
 
 
 def _similar_candidates(

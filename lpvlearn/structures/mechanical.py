@@ -133,20 +133,28 @@ class ImplicitMap(StructureMap):
         logs = np.linalg.lstsq(found[:, :-1], found[:, -1], rcond=None)[0]
         return np.asarray(np.exp(logs[: q - 1]))
 
-    def regular_point(self) -> Array:
-        """Parameters that bring M near the identity, so that S exists there."""
+    def regular_point(self, lower: ArrayLike, upper: ArrayLike) -> Array:
+        """Parameters that bring M near the identity, so that S exists there.
+
+        Mirrored at bounds that they are beyond.
+        """
         q, n = len(self.M) - 1, len(self.M[0])
         target = (np.eye(n) - self.M[0]).ravel()
         theta = np.linalg.lstsq(self.M[1:].reshape(q, -1).T, target, rcond=None)[0]
         rng = np.random.default_rng(0)
         # all points are regular but those of a curve; a few tries around one miss it
         for candidate in (theta, np.ones(q), *rng.uniform(0.5, 2.0, (8, q))):
+            for bound, beyond in ((lower, np.less), (upper, np.greater)):
+                mirrored = 2.0 * np.asarray(bound) - candidate
+                candidate = np.where(beyond(candidate, bound), mirrored, candidate)
+            candidate = np.clip(candidate, lower, upper)
             M = self.M[0] + np.tensordot(candidate, self.M[1:], 1)
             if 1.0 / np.linalg.cond(M) > _SINGULAR:
                 return candidate
         raise ValueError(
-            f"`{self.name}` must be regular for some parameters. Got a template that "
-            "is singular for all; a coordinate without mass is no state."
+            f"`{self.name}` must be regular for some parameters within the bounds. Got "
+            "a template that is singular for all; a coordinate without mass is no "
+            "state."
         )
 
 

@@ -144,7 +144,8 @@ class GrayBoxStructure(VersionedPickle):
         equations = map.equations if isinstance(map, FluxMap) else map
         self.implicit = equations if isinstance(equations, ImplicitMap) else None
         if self.implicit is not None and initial is None:
-            self.implicit.regular_point()  # that there is none is told of here
+            # that there is none is told of here
+            self.implicit.regular_point(self.lower, self.upper)
         for array in (self.initial, self.lower, self.upper, self.ranges):
             if array is not None:
                 array.setflags(write=False)
@@ -793,8 +794,9 @@ class GrayBoxStructure(VersionedPickle):
         """
         if self.initial is not None:
             return self.initial
-        zero = np.zeros(self.n_params)
-        start = self.implicit.regular_point() if self.implicit is not None else zero
+        start = np.zeros(self.n_params)
+        if self.implicit is not None:
+            start = self.implicit.regular_point(self.lower, self.upper)
         known = ~np.isnan(self.ranges[0])
         start = np.where(known, self.ranges.sum(0) / 2.0, start)
         return np.clip(start, self.lower, self.upper)

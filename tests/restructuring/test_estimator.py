@@ -969,3 +969,69 @@ def test_signs_that_nothing_tells_are_tried(signs):
     true = np.array(signs) * [0.65, 0.35, 0.72]
     model = GrayBoxRestructurer(structure).fit_model(StateSpace(*matrices(true)[:3]))
     assert model.relative_error_ < 1e-9
+
+
+# -- what may be wrong with a structure ------------------------------------------------
+
+MOTOR = {"J": 4e-5, "L": 2e-3, "R": 1.1, "b": 2e-4, "k": 0.06}
+
+
+def motor(back="-k"):
+    """Voltage, current and speed; `back` is what the speed does to the current."""
+    return GrayBoxStructure.from_template(
+        E=[["L", 0], [0, "J"]],
+        A=[["-R", back], ["k", "-b"]],
+        B=[[1], [0]],
+        C=[[1, 0], [0, 1]],
+    )
+
+
+def test_a_mass_that_is_negative_by_a_wrong_sign_is_told():
+    box, wrong = motor().model(MOTOR), motor(back="k")
+    with pytest.warns(UserWarning, match="`E` is not positive with J = -4e-05"):
+        found = GrayBoxRestructurer(wrong).fit_model(box)
+    assert found.relative_error_ < 1e-9
+    # it is meant, and what bounds exclude is no point to begin from
+    meant = wrong.with_bounds({"J": (None, 0)})
+    assert np.isfinite(meant.matrices(meant.reference)[0]).all()
+    found = GrayBoxRestructurer(meant).fit_model(box)  # a warning would be an error
+    assert found.relative_error_ < 1e-9
+
+
+def test_a_misfit_tells_of_bounds_and_of_the_feedthrough_that_is_left_out():
+    def known(at_once):
+        """A black box, and models a hundredth of a standard deviation from it."""
+        box = motor().model(MOTOR)
+        box = StateSpace(box.A, box.B, box.C, [[at_once], [0.0]])
+        pairs = []
+        for part in "ABCD":
+            for place in np.ndindex(getattr(box, part).shape):
+                size = 1e-3 * max(abs(getattr(box, part)[place]), 1.0)
+                around = []
+                for step in (DEVIATION * size, -DEVIATION * size):
+                    matrices = {name: getattr(box, name).copy() for name in "ABCD"}
+                    matrices[part][place] += step
+                    around.append(StateSpace(**matrices))
+                pairs.append(tuple(around))
+        return box, pairs
+
+    bounded = motor().with_bounds({"k": (0.07, 0.2)})
+    cases = (
+        (motor(), 0.1, r"The black box has D\[0\]\[0\], more than"),
+        (bounded, 0.0, "At their bounds stand k"),
+    )
+    for structure, at_once, told in cases:
+        box, pairs = known(at_once)
+        search = GrayBoxRestructurer(structure, norm="covariance")
+        with pytest.warns(UserWarning, match=f"as its noise explains .*{told}"):
+            search.fit_model(box, estimates=[(box, pairs)])
+
+
+def test_a_search_that_ends_where_nothing_moves_is_told():
+    spring = GrayBoxStructure.from_template(
+        E=[[1, 0], [0, "m"]], A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[0, 1]]
+    )
+    box = spring.model({"m": 1.0, "c": 0.1, "k": 1.0})
+    search = GrayBoxRestructurer(spring)
+    with pytest.warns(ConvergenceWarning, match="comes no nearer than 1e.02 %"):
+        search.fit_model(box, starts=[[1e30, 1e30, 1e30]], search=False)
