@@ -949,7 +949,8 @@ list, default=None
         saturated = not moving and dof <= repeated
         if isinstance(form, SplineLPV | RationalLPV) and self.restructurers_:
             known = found.theta, found.covariance, self.scheduling_names_
-            tell_of_wrong_values(kappa, *known)
+            if tell_of_wrong_values(kappa, *known):
+                return
         if isinstance(form, SplineLPV) or (saturated and n_places > 2):
             tell_unforeseen(
                 self.lpv_,

@@ -151,3 +151,16 @@ def test_laws_that_bend_are_no_exchange(law):
     tell_of_wrong_values(PLACES, theta, covariance, ["speed"])
     unknown = np.full_like(covariance, np.nan)
     tell_of_wrong_values(PLACES[::-1], theta, unknown, ["speed"])
+
+
+@pytest.mark.parametrize("point", [1, 4])
+def test_a_point_that_follows_no_law_of_the_others_is_named(point):
+    """As where a sensor had another gain there, which bends several parameters."""
+    theta, covariance = parameters(lambda k: 1.0 + k)
+    theta[point] *= [2.0, 0.5]
+    with pytest.warns(UserWarning, match=f"point {point} .* is unlike the others"):
+        assert tell_of_wrong_values(PLACES, theta, covariance, ["speed"])
+    for end in (0, 5):  # where a law may end
+        theta, covariance = parameters(lambda k: 1.0 + k)
+        theta[end] *= [2.0, 0.5]
+        assert not tell_of_wrong_values(PLACES, theta, covariance, ["speed"])
