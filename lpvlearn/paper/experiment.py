@@ -7,7 +7,7 @@ realizations, local models, restructuring, interpolation, and validation on a sw
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -58,8 +58,6 @@ class PaperExperiment:
         From `make_flexible_arm`.
     pipeline : LocalLPVPipeline
         The method, fitted.
-    comparison : list of StateSpace
-        The local models by the other subspace method, angle by angle.
     parameters : dict of str to ParameterSet
         "restructured", "analytic" and "balanced".
     lpv : dict of str to LPVStateSpace
@@ -69,14 +67,13 @@ class PaperExperiment:
     degree, n_realizations : int
         Of the interpolation; of the noise at each operating point.
     method, other_method : str
-        Subspace methods of `pipeline` and `comparison`.
+        Subspace methods of `pipeline` and of "table1_other".
     watch : Stopwatch
         Seconds of the steps, one after the other.
     """
 
     data: Bunch
     pipeline: LocalLPVPipeline
-    comparison: list[StateSpace]
     parameters: dict[str, ParameterSet]
     lpv: dict[str, LPVStateSpace]
     tables: dict[str, pd.DataFrame]
@@ -115,8 +112,8 @@ def run_paper_experiment(
     verbose : int, default=0
         1 shows progress bars, and lines of other steps that take long.
     meanwhile : function, default=None
-        Called with the experiment, without `comparison` and what follows from it, while
-        other processes (`n_jobs`) are at work on that.
+        Called with the experiment, without "table1_other", while other processes
+        (`n_jobs`) are at work on that.
 
     Returns
     -------
@@ -184,7 +181,6 @@ def run_paper_experiment(
     experiment = PaperExperiment(
         data,
         pipeline,
-        [],
         parameters,
         lpv,
         tables,
@@ -201,7 +197,7 @@ def run_paper_experiment(
         comparison = [done.result for done in compared() if done is not None]
     tables["table1_other"] = local_table(comparison, data)
     tables["timing"] = watch.table()
-    return replace(experiment, comparison=comparison)
+    return experiment
 
 
 def _experiments(data: Bunch) -> list[Any]:

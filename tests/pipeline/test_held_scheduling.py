@@ -95,7 +95,7 @@ def test_curves_are_exact_without_noise():
     for group in points_of(X, y).experiments:
         (run,) = group
         charge = run.kappa.mean()
-        found = curve_at_rest(group)
+        found = curve_at_rest(group, "auto")
         np.testing.assert_allclose(found.slopes, 0.9 + 2.0 * 0.3 * charge, rtol=1e-3)
         np.testing.assert_allclose(found.bows, 0.3, rtol=1e-2)
         assert found.variances < 1e-6
@@ -106,7 +106,7 @@ def test_held_experiments_lack_only_what_the_scheduling_moved():
     X, y = discharged()
     points = points_of(X, y)
     for before, after in zip(
-        points.experiments, _held(points, RUNNER).experiments, strict=True
+        points.experiments, _held(points, RUNNER, "auto").experiments, strict=True
     ):
         (run,), (held,) = before, after
         moved = at_rest(run.kappa) - at_rest(run.kappa).mean()
@@ -117,19 +117,19 @@ def test_held_experiments_lack_only_what_the_scheduling_moved():
 
 @pytest.mark.parametrize("options", [{"moved": 0.0}, {"measured": "charge"}])
 def test_what_does_not_move_or_schedules_itself_stays(options):
-    assert _held(points_of(*discharged(**options)), RUNNER) is None
+    assert _held(points_of(*discharged(**options)), RUNNER, "auto") is None
 
 
 def test_inputs_at_other_levels_stay():
     X, y = discharged()
     X["current"] += 10.0 * X["run"]
-    assert _held(points_of(X, y), RUNNER) is None
+    assert _held(points_of(X, y), RUNNER, "auto") is None
 
 
 def test_noise_of_the_scheduling_stays():
     X, y = discharged(moved=0.0)
     X["charge"] += 0.01 * np.random.default_rng(0).standard_normal(len(X))
-    assert _held(points_of(X, y), RUNNER) is None
+    assert _held(points_of(X, y), RUNNER, "auto") is None
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_every_output_is_held_by_itself():
     other = X.assign(output=0.01 * X["current"] + rng.standard_normal(4)[X["run"]])
     both = y.assign(other=other["output"] + 1e-4 * rng.standard_normal(len(y)))
     (alone,), (beside,) = (
-        _held(points_of(X, some), RUNNER).experiments[1] for some in (y, both)
+        _held(points_of(X, some), RUNNER, "auto").experiments[1] for some in (y, both)
     )
     np.testing.assert_allclose(beside.measured[:, 0], alone.measured[:, 0], atol=2e-4)
 
@@ -148,7 +148,7 @@ def test_slopes_that_noise_tells_give_way_to_what_the_points_tell():
     rng, (X, y) = np.random.default_rng(0), discharged()
     clean = X["charge"]
     X["charge"] = clean + 0.0015 * rng.standard_normal(len(X))
-    for run, group in enumerate(_held(points_of(X, y), RUNNER).experiments):
+    for run, group in enumerate(_held(points_of(X, y), RUNNER, "auto").experiments):
         moved = at_rest(clean[X["run"] == run].to_numpy())
         left = group[0].measured[:, 0] - y["output"][X["run"] == run] + moved
         assert np.std(left) < 0.4 * np.std(moved)

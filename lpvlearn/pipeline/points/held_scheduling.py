@@ -36,6 +36,7 @@ from ...lpv.equilibria import STANDING
 from ...lpv.spline import SplineLPV
 from ...subspace.estimator import SubspaceLTI
 from ...subspace.evidence.constants import CERTAIN
+from ...subspace.telling import unheard
 from ...systems.modes import spectral_radius
 from ..running.runner import PointRunner
 from .local_models import LocalModel, channel_sizes, is_left, motions
@@ -59,7 +60,7 @@ def identified_as_held(
     points: OperatingPoints,
     identify: Callable[[Any, OperatingPoints, PointRunner], _Identified],
     runner: PointRunner,
-    order: Any = "auto",
+    order: Any,
 ) -> tuple[_Identified, OperatingPoints, Any]:
     """Models of the points that did not fail, all points, and the estimator of both.
 
@@ -69,6 +70,9 @@ def identified_as_held(
     still = _held(points, runner, order)
     if still is None:
         return identify(local, points, runner), points, local
+    own: _Identified = [], points
+    with collected() as told, suppress(ValueError):
+        own = identify(local, points, runner)
     ways = [local]
     if is_left(local, "offset"):
         ways.append(clone(local).set_params(offset="constant"))
@@ -76,21 +80,18 @@ def identified_as_held(
         held: _Identified = [], still
         with collected() as told_held, suppress(ValueError):
             held = identify(way, still, replace(runner, verbose=0))
-        if held[0] and all(model.n_trend for model in held[0]):
+        pairs = zip(own[0], held[0], strict=False)
+        gain = sum(a.criterion - b.criterion for a, b in pairs)  # NaN: not told
+        n_own, n_held = len(own[0]), len(held[0])
+        if n_own > n_held or (n_own == n_held and not gain > CERTAIN):
             break
-    else:
-        return identify(local, points, runner), points, local
-    own: _Identified = [], points
-    with collected() as told, suppress(ValueError):
-        own = identify(local, points, runner)
-    pairs = zip(own[0], held[0], strict=False)
-    gain = sum(a.criterion - b.criterion for a, b in pairs)  # NaN: not told
-    n_own, n_held = len(own[0]), len(held[0])
-    if n_own > n_held or (n_own == n_held and not gain > CERTAIN):
-        repeat(told)
-        return own, points, local
-    repeat(told_held)
-    return held, still, way
+        if held[0] and all(model.n_trend for model in held[0]):
+            repeat(told_held)
+            return held, still, way
+    if not own[0]:
+        return identify(local, points, runner), points, local  # which fails
+    repeat(told)
+    return own, points, local
 
 
 def tell_of_held(names: Sequence[Hashable]) -> None:
@@ -105,7 +106,7 @@ def tell_of_held(names: Sequence[Hashable]) -> None:
 
 
 def _held(
-    points: OperatingPoints, runner: PointRunner, order: Any = "auto"
+    points: OperatingPoints, runner: PointRunner, order: Any
 ) -> OperatingPoints | None:
     """The points without what their outputs do as scheduling variables move.
 
@@ -127,14 +128,14 @@ def _held(
     bends = [_about_mean(rest.predict(run.kappa)) for run in runs]
     if not (_farthest(bends) > _SLIGHT).any():
         return None
-    known = replace(runner, verbose=0).run(
+    done = replace(runner, verbose=0).run(
         "curves at rest",
         curve_at_rest,
         [(_farthest_moved(group),) for group in points.experiments],
         points.kappa,
         order=order,
     )
-    curves = [done.result for done in known if done is not None]
+    curves = [one.result for one in done if one is not None]
     changes = _changes(points, bends, curves, sizes[1])
     moves = _moves(changes, [run.measured / sizes[1] for run in runs])
     if not moves.any():
@@ -213,7 +214,7 @@ class Curve(NamedTuple):
     variances: Array  # likewise, of the slopes; infinite where these are not told
 
 
-def curve_at_rest(group: Sequence[Experiment], order: Any = "auto") -> Curve:
+def curve_at_rest(group: Sequence[Experiment], order: Any) -> Curve:
     """That of one point: static gains from scheduling variables and their squares.
 
     Of a model of that order; squares where it is likelier with them.
@@ -233,7 +234,7 @@ def curve_at_rest(group: Sequence[Experiment], order: Any = "auto") -> Curve:
         table, y = as_table(driven)
         *inputs, label = table.columns
         roles = {"inputs": inputs, "experiment": label, "missing": "split"}
-        with collected(), suppress(ValueError):
+        with unheard(), collected(), suppress(ValueError):
             found = SubspaceLTI(order, offset="constant", **roles).fit(table, y)
             std = found.frequency_response_std(np.zeros(1))[0].real
             longest = max(len(run.rows) for run in group)

@@ -338,7 +338,7 @@ def _told_by(fitted: Any, experiments: Sequence[Experiment]) -> dict[str, Any]:
     """What an estimator chose for experiments, as a `LocalModel` has it."""
     return {
         "order": fitted.lti_.order,
-        "horizon": _horizon(fitted),
+        "horizon": getattr(fitted, "horizon_", None),
         "method": getattr(fitted, "method_", None),
         "costs": _costs(fitted, experiments),
     }
@@ -878,8 +878,3 @@ def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:
         orders = orders - max(0, orders[np.argmin(costs)] - fitted.order_)
     found = zip(orders.tolist(), costs.tolist(), strict=True)
     return {order: cost for order, cost in found if order >= 0}
-
-
-def _horizon(fitted: Any) -> int | None:
-    horizon = getattr(fitted, "horizon_", None)
-    return None if horizon is None else int(horizon)

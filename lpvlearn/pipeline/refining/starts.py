@@ -30,6 +30,7 @@ from ...models.scheduling_range import grid_over
 from ...restructuring.estimator import GrayBoxRestructurer
 from ...structures.structure import GrayBoxStructure
 from ...subspace.estimator import SubspaceLTI
+from ...subspace.telling import unheard
 from ..checks.error_warnings import CONSTANT
 from ..checks.stability import grows
 from ..one_basis.black_boxes import balanced_entries
@@ -93,7 +94,7 @@ def best_start(
     records = [record_of(e, dt) for e in experiments]
     seen = np.vstack([r.kappa for r in records]) if names else np.zeros((1, 1))
     bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
-    with collected():  # where a search begins, nobody needs to hear of
+    with unheard(), collected():  # where a search begins, nobody needs to hear of
         local, most = of_structure(wanted.local, wanted.structure)
         whole = _time_invariant(local, experiments, dt, most)
         models = _constant_models(wanted, whole, experiments, bounds)

@@ -97,9 +97,8 @@ def tables(
             "horizon": model.horizon,
             "local_BFT": fit_of(model.lti, *known),
         }
-        missed |= lpv.offsets is None and _misses_constants(
-            model, group, sampling_time, lpv.hold
-        )
+        if lpv.offsets is None and not missed:
+            missed = _misses_constants(model, group, sampling_time, lpv.hold)
         if found.restructurers:
             structured = fit_of(gray_box, *known)
             row["structured_BFT"] = structured
@@ -199,8 +198,9 @@ def _misses_constants(
     best, without = (
         fit_of(model.lti, measured, sampling_time, n, hold) for n in (constants, 0)
     )
-    far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
-    return best - without > _WORTH or (without < _POOR and any(far))
+    if best - without > _WORTH or not without < _POOR:
+        return best - without > _WORTH
+    return any((abs(mean) > _FAR * scale).any() for mean, scale in motions(group))
 
 
 def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
