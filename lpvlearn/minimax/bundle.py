@@ -31,9 +31,8 @@ from .problem import (
 
 Array = NDArray[np.float64]
 
-_MAX_CUTS = (
-    60  # some times as many as the peaks of an optimum; the rest only costs time
-)
+# Some times as many as the peaks of an optimum; the rest only costs time.
+_MAX_CUTS = 60
 _ROOM = 10  # cuts for which room is made at once
 _SERIOUS = 0.1  # a step is taken when it brings that part of the promised decrease
 _GOOD = 0.7  # the model was good: the next step may be longer

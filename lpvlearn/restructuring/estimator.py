@@ -22,16 +22,14 @@ from sklearn.utils import check_random_state
 from sklearn.utils.metadata_routing import UNUSED
 from sklearn.utils.validation import check_is_fitted
 
-from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
+from ..exceptions import VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
-from ..models.statespace import DEVIATION, StateSpace
-from ..structures.interchanges import INTERCHANGE, exchangeable, known_before
+from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import PeakSet
 from ..systems.threads import one_blas_thread
 from ..validation import (
     flag,
-    listed,
     naming_argument,
     number,
     one_of,
@@ -44,7 +42,15 @@ from ..validation import (
     whole_number,
 )
 from .deadline import bounded, time_is_up
-from .equal_optima import are_apart, as_good
+from .fit_warnings import (
+    tell_of_misfit,
+    tell_of_negative_masses,
+    tell_of_nonlinear,
+    tell_of_open_parameters,
+    tell_of_others,
+    tell_of_poor_fit,
+    tell_of_search,
+)
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import (
@@ -58,37 +64,24 @@ from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
     CLEAN_FIT,
-    EXACT_FIT,
     FrequencyWeight,
     RestructuringProblem,
     problem_from_models,
     problem_from_response,
 )
 from .similarity import minimise_bilinear
-from .starts import DISCRETE_BOX, known_signs
 from .starts import search as starts_of
 from .uncertainty import ParameterUncertainty
 
 Array = NDArray[np.float64]
 
-_INTEGRATOR = (
-    " The structure has poles on the axis or beyond by its fixed entries, and the "
-    "black box lacks them: name the outputs that integrate, "
-    "SubspaceLTI(integrating=...), or let a parameter damp what oscillates."
-)
-_AT_BOUND = 1e-6  # relative distance to a bound that holds a parameter
 _MOST_STARTS = 100_000  # all are drawn at once
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
-_POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
-_NOTHING = 0.9  # that of a structure that explains next to nothing
-_SEEN = 5.0  # standard deviations of an entry of D that is none by chance
 
-_AGREE = 1e-3  # relative difference of the errors of fits in one basin
 # Of the H-infinity norm's own, and of the black box: an error that is larger by both is
 # none that weighing by the uncertainty of the black box should lead to.
 _ASTRAY, _FAR = 10.0, 0.5
-_PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "params_covariance_",
@@ -100,7 +93,6 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "p_value_",
 )
 
-_NAMED = 6  # parameters in a message; of more the number is enough
 _DRAWS = 32  # of the noise: standard deviations to an eighth
 _EFFORT = 512  # realizations times parameters, of which more are left out beyond these
 
@@ -383,7 +375,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             spread = at.covariance_of_runs(seen, norm)
             self.params_covariance_ = spread * (len(seen) / len(realizations))
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
-        self._tell_of_nonlinear(at)
+        tell_of_nonlinear(self, at)
         return self
 
     @one_blas_thread
@@ -472,8 +464,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             seed = check_random_state(self.random_state).randint(2**31)
             self.params_covariance_ = at.covariance_of_noise(_DRAWS, seed)
             self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
-        self._tell_of_nonlinear(at)
-        self._tell_of_others(problem)
+        tell_of_nonlinear(self, at)
+        tell_of_others(self, problem)
         self.n_features_in_ = 1
         return self
 
@@ -694,95 +686,18 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.identifiability_ = at.identifiability()
             guessed = not isinstance(self.init, str) or only_given
             doubted = not (guessed or found.certain)
-            self._warn(problem, result, doubted, hurried, settled)
-        return at
-
-    def _tell_of_others(self, problem: RestructuringProblem) -> None:
-        """Tell of other parameters with the same response, but of open ones."""
-        theta, names = self.start_params_, self.structure_.parameter_names
-        known = self.identifiability_.rank == len(theta)
-        if not known or self.fit_error_ > _POOR_FIT or not isinstance(self.init, str):
-            return
-        other = as_good(problem, theta, self.fit_error_)
-        if other is None:
-            return
-        apart = np.flatnonzero(are_apart(other, theta))
-        gains = [self.identifiability_.sensitivities[names[j]] for j in apart]
-        moved = np.array(gains) * max(self.fit_error_, EXACT_FIT) * np.abs(theta[apart])
-        if not (np.abs(other - theta)[apart] > moved).all():
-            return  # errors of the response may lead as far
-        values = listed([f"{names[j]} = {other[j]:.4g}" for j in apart], _NAMED)
-        warn(
-            f"other values of {listed([repr(names[j]) for j in apart], _NAMED)} give "
-            f"the same response, {values}: the data do not tell which are right, nor "
-            "do `confidence_intervals`, which are about `params_` alone. Say it by "
-            "structure.with_bounds(), structure.with_ranges(), or a first guess, "
-            "`init`.",
-            kind=INTERCHANGE,
-        )
-
-    def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
-        """Where `params_covariance_` is that of a linear model, and it is none."""
-        if not hasattr(self, "params_covariance_"):
-            return
-        bent = at.not_linear(self.params_covariance_)
-        if bent:
-            names = listed([repr(name) for name in bent], _NAMED)
-            warn(
-                f"the intervals of {names} are not to be trusted: "
-                "within two standard deviations the response does not change in "
-                "proportion to them, as where two parts of the structure are so alike "
-                "that the noise hides which is which. Use more data or less noise, or "
-                "give what is known of them (a value, or bounds)."
+            tell_of_search(
+                self,
+                problem,
+                result,
+                doubted=doubted,
+                hurried=hurried,
+                settled=settled,
             )
-
-    def _tell_of_negative_masses(self) -> None:
-        """Tell of ``M(theta)``, or E, that is not positive, where nobody said so."""
-        equations, theta = self.structure_.implicit, self.params_
-        if equations is None:
-            return
-        M = equations.M[0] + np.tensordot(theta, equations.M[1:], 1)
-        free = equations.M[1:].any((1, 2)) & (known_signs(self.structure_) == 0.0)
-        negative = np.flatnonzero(free & (theta < 0.0))
-        symmetric = np.isfinite(M).all() and (M == M.T).all()
-        if not symmetric or not len(negative) or np.linalg.eigvalsh(M)[0] >= 0.0:
-            return
-        names = self.structure_.parameter_names
-        values = listed([f"{names[j]} = {theta[j]:.3g}" for j in negative], _NAMED)
-        warn(
-            f"`{equations.name}` is not positive with {values}, as no mass, inertia or "
-            "capacity is. Check the signs of the template; or give bounds that say so, "
-            "by structure.with_bounds()."
-        )
-
-    def _without_feedthrough(self, estimates: Sequence[Estimate]) -> str:
-        """Which entries of D the structure lacks, as a sentence; nothing for none."""
-        dropped = self.dropped_feedthrough_
-        pairs = [pair for _, both in estimates for pair in both]
-        if not pairs or not dropped.any():
-            return ""
-        steps = np.array([above.D - below.D for above, below in pairs])
-        std = np.linalg.norm(steps, axis=0) / (2.0 * DEVIATION * len(estimates))
-        seen = np.argwhere(np.abs(dropped) > _SEEN * std)
-        if not len(seen):
-            return ""
-        places = listed([f"D[{i}][{j}]" for i, j in seen], _NAMED)
-        return (
-            f" The black box has {places}, more than by chance, where the structure "
-            "has none."
-        )
-
-    def _at_bounds(self) -> str:
-        """Which parameters stand at their bounds, as a sentence; nothing for none."""
-        structure, theta = self.structure_, self.params_
-        bounds = np.array([structure.lower, structure.upper])
-        held = np.isclose(theta, bounds, rtol=_AT_BOUND, atol=0.0).any(axis=0)
-        names = [
-            name for name, k in zip(structure.parameter_names, held, strict=True) if k
-        ]
-        if not names:
-            return ""
-        return f" At their bounds stand {', '.join(names)}: leave them more room."
+            tell_of_poor_fit(self, problem)
+            tell_of_negative_masses(self)
+            tell_of_open_parameters(self)
+        return at
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -806,7 +721,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         theta, result, floor = minimise_hinf(
             system, fits, margin, SOLVERS[self.solver], **options
         )
-        if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
+        if problem.is_least(result.peaks.top):
             # no model is nearer; where the error is equally high everywhere, its peaks
             # could not tell
             bend = max(result.second_order, 0.0)
@@ -900,117 +815,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
         if not found.is_plausible:
-            warn(
-                f"the structure lies {np.sqrt(found.misfit):.3g} times as far from the "
-                "black box as its noise explains (`p_value_` "
-                f"{found.p_value:.1g}): the standard deviations are too small then, "
-                "and the parameters meet the frequencies best that the data tell most "
-                "of. Give the structure what it lacks, the local models the delay of "
-                "an input that answers late (`input_delay`), or keep the H-infinity "
-                "optimum by norm='hinf' (in a pipeline, efficient=False)."
-                + self._at_bounds()
-                + self._without_feedthrough(estimates)
-            )
+            tell_of_misfit(self, found, estimates)
         return found.converged and found.p_value > IMPLAUSIBLE
-
-    def _warn(
-        self,
-        problem: RestructuringProblem,
-        result: MinimaxResult,
-        doubted: bool,
-        hurried: bool,
-        settled: bool,
-    ) -> None:
-        """Warn of a search that did not converge, a poor fit, and open parameters.
-
-        And of a `doubted` fit, at which one round of starts alone ended, or of a search
-        that was `hurried`. Efficient parameters that are `settled`, found and with an
-        error that the noise explains, do not hang on where the search for the least
-        norm stopped before them; those of a wrong basin noise would not explain.
-        """
-        errors = self.starts_["relative_error"].to_numpy()
-        timed_out = hurried and errors[0] > problem.enough
-        if timed_out or (time_is_up() and not result.converged):
-            warn(
-                "the search ended at `max_time`, with a relative error of "
-                f"{self.relative_error_:.2g} and `stationarity_` "
-                f"{self.stationarity_:.1g} (0 at an optimum): it did not look at all "
-                "starts, or not to the end. The best point is kept. Raise `max_time`, "
-                "or give `init`.",
-                ConvergenceWarning,
-            )
-            doubted = False  # no more can be said of the starts
-        elif not (result.converged or settled):
-            spent = self.n_iter_ >= self.max_iter
-            warn(
-                f"the search {'ended at' if spent else 'stalled before'} "
-                f"`max_iter`={self.max_iter} steps, with `stationarity_` "
-                f"{self.stationarity_:.1g} (0 at an optimum): a lower norm may be "
-                f"near. {f'It ended because {result.cause}. ' if result.cause else ''}"
-                "The best point is kept. "
-                + ("Raise `max_iter`" if spent else "Try another `random_state`")
-                + ", or take a structure of fewer parameters.",
-                ConvergenceWarning,
-            )
-        together = int((errors <= errors[0] * (1.0 + _AGREE)).sum())
-        proven = self.error_ <= problem.lower_bound * (1.0 + _PROVEN)
-        if doubted and not proven:
-            beyond = errors[together:]
-            warn(
-                f"one round of starts alone ended at the best fit, {together} of "
-                f"{len(errors)}, of the relative error {errors[0]:.2g}"
-                + (f" (the next one {beyond[0]:.2g})" if len(beyond) else "")
-                + ": it may not be the best there is. Raise `n_starts`, or give "
-                "`init`, to confirm it.",
-                ConvergenceWarning,
-            )
-        if self.convergence_ == "saddle":
-            warn(
-                "the search ended at a saddle (`second_order_` "
-                f"{self.second_order_:.2g}): a lower norm is near, and no step found "
-                "it. Try another `random_state`, or give `init`.",
-                ConvergenceWarning,
-            )
-        floor = self.structural_floor_ / problem.reference
-        if (
-            self.fit_error_ > _NOTHING
-        ):  # far off no parameters move it: that is no floor
-            floor = 0.0
-        explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
-        error = min(self.fit_error_, self.relative_error_) - floor
-        if error > max(_POOR_FIT, problem.enough) and not explained:
-            warn(
-                f"the structure comes no nearer than {100 * self.fit_error_:.2g} % "
-                f"(root mean square over frequency) to the black box; {together} of "
-                f"{len(errors)} fits from different starts end there. "
-                + (
-                    "It probably cannot represent the model any better."
-                    if together > 1
-                    else "Either it cannot represent the model, or the search ended in "
-                    "a wrong basin."
-                )
-                + _INTEGRATOR * problem.lacks_poles
-                + self._at_bounds()
-                + " Give `init`, or raise `n_starts`, to search elsewhere."
-                + DISCRETE_BOX
-                * (self.structure is not None and not self.lti_.is_continuous),
-                ConvergenceWarning,
-            )
-        self._tell_of_negative_masses()
-        if self.identifiability_.rank < self.structure_.n_params:
-            warn(str(self.identifiability_), RankWarning)
-            return
-        known = known_before(self.structure_, self.init)
-        names = exchangeable(self.structure_, self.params_, known)
-        if names:
-            warn(
-                f"the values of {listed([repr(name) for name in names], _NAMED)} may "
-                "be those of one another: no response tells these parts of the "
-                "structure apart. Say which is which by structure.with_bounds(), "
-                "structure.with_ranges(), or a first guess, `init`; or number their "
-                "names, as 'lag_1' and 'lag_2', where it does not matter.",
-                kind=INTERCHANGE,
-            )
 
     # -- use -----------------------------------------------------------------------
 

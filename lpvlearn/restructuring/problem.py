@@ -64,6 +64,8 @@ _LEAST_DECAY = 1e-4
 # as the true parameters' own.
 _NOISY = 1.5
 
+_PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
+
 _SAME = 1e-6  # relative difference of delays that is rounding
 
 _MOST_WEIGHTED = 1e60  # size of a weighted response: fourth powers of it are numbers
@@ -132,6 +134,10 @@ class RestructuringProblem:
         """The relative error that rounding makes of both models."""
         units = _UNITS * self.system.rounding(theta) / self.reference
         return min(units, _MOST_ROUNDING)
+
+    def is_least(self, error: float) -> bool:
+        """Whether no parameters have a smaller error than this one, to rounding."""
+        return error <= self.lower_bound * (1.0 + _PROVEN)
 
     @property
     def enough(self) -> float:
