@@ -23,6 +23,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import NO_TIME, ROLES, Experiment
 from ..data.forgotten_roles import DISORDER
+from ..data.motion import channel_sizes
 from ..data.operating_points import (
     OperatingPoints,
     check_outputs,
@@ -86,17 +87,13 @@ from .one_basis.structured_models import (
 from .one_basis.together import through_black_boxes
 from .points.common_choices import identify_points, of_structure
 from .points.common_delay import common_delay
+from .points.continuous_time import Integrates
+from .points.fitting import estimates_outputs, is_left
 from .points.held_scheduling import identified_as_held, tell_of_held
 from .points.integrators import integrated
 from .points.late_inputs import with_delays
 from .points.left_out import tell_of_two_points, tell_unforeseen
-from .points.local_models import (
-    Integrates,
-    LocalModel,
-    channel_sizes,
-    estimates_outputs,
-    is_left,
-)
+from .points.local_models import LocalModel
 from .points.mislabelled import tell_of_mislabelled, tell_of_wrong_values
 from .refining.coefficients import known_coefficients, local_covariance, refine_model
 from .refining.errors import local_output_errors, tell_of_missed

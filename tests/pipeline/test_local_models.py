@@ -16,11 +16,9 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.points import local_models
-from lpvlearn.pipeline.points.local_models import (
-    LocalModel,
-    identify_point,
-)
+from lpvlearn.pipeline.points.fitting import _costs
+from lpvlearn.pipeline.points.local_models import LocalModel, identify_point
+from lpvlearn.pipeline.points.rest import equilibrium
 
 from ..conftest import ROLES
 
@@ -287,11 +285,11 @@ def test_a_mode_that_stands_for_constants_does_not_tell_where_outputs_rest():
     fitted = SubspaceLTI(1, offset=None).fit(u, y - 3.5)
     fitted.offset, fitted.lti_ = "auto", StateSpace(1.0 - 1e-5, 0.1, 1.0, None, 1.0)
     lti = fitted.lti_.to_continuous()
-    ((u0,), (y0,)) = local_models._equilibrium(lti, [fitted], [run])
+    ((u0,), (y0,)) = equilibrium(lti, [fitted], [run])
     assert y0 == pytest.approx(3.5, abs=0.1)
     assert y0 == pytest.approx(lti.dc_gain().item() * u0)
     low = Experiment(0, np.arange(300), u, y - 3.5, sampling_time=1.0)
-    assert local_models._equilibrium(lti, [fitted], [low]) == (0.0, 0.0)
+    assert equilibrium(lti, [fitted], [low]) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("method, cheapest", [("po-moesp", 3), ("pbsid", 2)])
@@ -305,7 +303,7 @@ def test_states_of_the_noise_are_none_of_the_plant(method, cheapest):
         )
 
     run = Experiment(0, np.arange(9), np.ones((9, 1)), np.ones((9, 1)))
-    costs = local_models._costs(Fitted(), [run])
+    costs = _costs(Fitted(), [run])
     assert min(costs, key=costs.__getitem__) == cheapest
     assert costs[cheapest - 1] == 9.0 and min(costs) == 0
 

@@ -17,7 +17,9 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.models.statespace import DEVIATION
-from lpvlearn.pipeline.points.local_models import _integrating_outputs
+from lpvlearn.pipeline.points.continuous_time import (
+    integrating_outputs as _integrating_outputs,
+)
 from lpvlearn.subspace.fits.integrating import integrated
 
 STEP = 0.02

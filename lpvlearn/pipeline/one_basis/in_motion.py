@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.motion import motions
 from ...data.operating_points import OperatingPoints
 from ...exceptions import warn
 from ...lpv.model import LPVStateSpace
-from ..points.local_models import motions
 
 Array = NDArray[np.float64]
 

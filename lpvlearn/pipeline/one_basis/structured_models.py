@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from ...data.experiments import are_beginnings
+from ...data.motion import channel_sizes, motions
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, retold, take_back, warn
 from ...lpv.auto import AutoLPV
@@ -40,7 +41,7 @@ from ...structures.interchanges import (
 from ...structures.structure import GrayBoxStructure
 from ...systems.beginnings import Beginning, begin_held, waiting
 from ..points.left_out import NEAR, largest_difference
-from ..points.local_models import LocalModel, channel_sizes, motions
+from ..points.local_models import LocalModel
 from ..running.runner import Done, PointRunner, place_of, tell_skipped
 from .black_boxes import (
     aligned_black_boxes,

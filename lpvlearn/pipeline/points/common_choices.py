@@ -28,13 +28,8 @@ from ...structures.structure import GrayBoxStructure
 from ...subspace.estimator import SubspaceLTI
 from ..running.runner import Done, PointRunner, tell_skipped
 from .common_delay import some_of, with_one_delay
-from .local_models import (
-    LocalModel,
-    identify_point,
-    integrates,
-    is_left,
-    labels_of,
-)
+from .fitting import integrates, is_left, labels_of
+from .local_models import LocalModel, identify_point
 
 Array = NDArray[np.float64]
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from ...data.experiments import Experiment, as_table
+from ...data.motion import channel_sizes, motions
 from ...data.operating_points import OperatingPoints
 from ...exceptions import collected, repeat, warn
 from ...lpv.equilibria import STANDING
@@ -39,7 +40,8 @@ from ...subspace.evidence.constants import CERTAIN
 from ...subspace.telling import unheard
 from ...systems.modes import spectral_radius
 from ..running.runner import PointRunner
-from .local_models import LocalModel, channel_sizes, is_left, motions
+from .fitting import is_left
+from .local_models import LocalModel
 
 Array = NDArray[np.float64]
 

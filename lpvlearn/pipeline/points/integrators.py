@@ -15,8 +15,9 @@ from sklearn.base import clone
 
 from ...data.operating_points import OperatingPoints
 from ...exceptions import Told, collected, warn
+from .continuous_time import HARDLY, integrating_places
 from .fits import Measured, fit_of
-from .local_models import HARDLY, LocalModel, integrating_places
+from .local_models import LocalModel
 
 # Of squared errors: those of models that know of integrators; and percents of the
 # outputs that are as good as none.

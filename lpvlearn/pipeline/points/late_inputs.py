@@ -17,7 +17,9 @@ from ...data.operating_points import OperatingPoints
 from ...exceptions import Told, collected, warn
 from ...subspace.estimator import SubspaceLTI
 from .common_delay import cost_with_delay, delay_in_samples
-from .local_models import ALTERNATES, LocalModel, integrates
+from .continuous_time import ALTERNATES
+from .fitting import integrates
+from .local_models import LocalModel
 
 # What is told of models that a delay is missing in: that, what else a model of a given
 # order may lack, and poles that alternate from sample to sample.

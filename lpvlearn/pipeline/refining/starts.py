@@ -43,12 +43,8 @@ from ..one_basis.structured_models import (
 )
 from ..points.common_choices import identify_points, of_structure
 from ..points.common_delay import common_delay
-from ..points.local_models import (
-    LocalModel,
-    balanced_by_motion,
-    identify_point,
-    is_left,
-)
+from ..points.fitting import is_left
+from ..points.local_models import LocalModel, balanced_by_motion, identify_point
 from ..running.runner import PointRunner
 from .errors import record_of
 

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ...data.experiments import Experiment
+from ...data.motion import motions
 from ...exceptions import warn
 from ...lpv.model import LPVStateSpace
 from ...lpv.spline import SplineLPV
@@ -21,7 +22,7 @@ from ...validation import number_shown
 from ..one_basis.structured_models import StructuredModels
 from ..points.fits import Measured, fit_of
 from ..points.left_out import listed_errors
-from ..points.local_models import LocalModel, motions
+from ..points.local_models import LocalModel
 
 Array = NDArray[np.float64]
 
