@@ -72,16 +72,15 @@ from ..validation import (
 from .checks.stability import GROWS, growth_rates
 from .one_basis.between_samples import restructured_by_hold
 from .one_basis.black_boxes import foreseen_order
+from .one_basis.foreseen_parameters import with_foreseen
 from .one_basis.in_motion import tell_of_other_states
+from .one_basis.mirror_images import mirror_images, tell_of_mirror_images
 from .one_basis.structured_models import (
     StructuredModels,
     local_ones_begin_held,
-    mirror_images,
     offsets_of_points,
     over_points,
     restructure_points,
-    tell_of_mirror_images,
-    with_foreseen,
     without_structure,
 )
 from .one_basis.together import through_black_boxes

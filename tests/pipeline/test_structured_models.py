@@ -21,11 +21,11 @@ from lpvlearn import (
     make_bft_scorer,
 )
 from lpvlearn.data.experiments import Experiment
+from lpvlearn.pipeline.one_basis.foreseen_parameters import with_foreseen
 from lpvlearn.pipeline.one_basis.structured_models import (
     StructuredModels,
     covariance_of_parameters,
     restructure_points,
-    with_foreseen,
 )
 from lpvlearn.pipeline.points.local_models import LocalModel, identify_point
 

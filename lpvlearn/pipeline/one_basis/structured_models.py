@@ -20,10 +20,10 @@ from sklearn.base import clone
 from ...data.experiments import are_beginnings
 from ...data.motion import channel_sizes, motions
 from ...data.operating_points import OperatingPoints
-from ...exceptions import collected, retold, take_back, warn
+from ...exceptions import collected, retold, warn
 from ...lpv.auto import AutoLPV
 from ...lpv.equilibria import points_of_work
-from ...lpv.left_out import interpolated_without, takes_covariance, values_left_out
+from ...lpv.left_out import takes_covariance
 from ...lpv.model import LPVStateSpace
 from ...models.scheduling_range import in_range_of_points
 from ...models.statespace import DEVIATION, ModelPair, StateSpace
@@ -31,16 +31,8 @@ from ...restructuring.deadline import bounded, time_is_up
 from ...restructuring.minimise_covariance import Estimate
 from ...restructuring.problem import GOOD_FIT, problem_from_models
 from ...restructuring.uncertainty import ParameterUncertainty
-from ...structures.interchanges import (
-    INTERCHANGE,
-    as_plausible,
-    interchanges,
-    known_before,
-    told_by_motion,
-)
 from ...structures.structure import GrayBoxStructure
 from ...systems.beginnings import Beginning, begin_held, waiting
-from ..points.left_out import NEAR, largest_difference
 from ..points.local_models import LocalModel
 from ..running.runner import Done, PointRunner, place_of, tell_skipped
 from .black_boxes import (
@@ -61,18 +53,6 @@ _SWEEPS = 4  # passes over the points: help travels that far from a good one
 _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
 _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
-
-# Of parameters at a point: the standard deviation, by those of the others, from which
-# these may foresee them better, and points that are enough for that. And of others
-# there that are foreseen elsewhere: by so many times what is usual, up to which error
-_UNTOLD, _FORESEEING = 10.0, 4
-_ASTRAY, _LIKE = 5.0, 0.01
-
-# Change of what is remembered after a jump over the range from which an interchange is
-# another LPV model, and is told of (in fast sweeps the outputs then miss by a tenth);
-# and interchanges that are compared along experiments at most
-_ANOTHER, _TOLD = 0.01, 0.2
-_IMAGES = 24
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -188,154 +168,9 @@ def _black_boxes(
         tell_of_forced(local, points.kappa, longest)
         models = [balanced(model) for model in local]
         structure, theta = balanced_entries(models, local[0].integrating)
-    models = _delayed(structure, theta, local)
+    models = delayed_models(structure, theta, local)
     unknown = _unknown_covariance(theta)
     return StructuredModels(points, local, structure, theta, unknown, models, [])
-
-
-def with_foreseen(found: StructuredModels) -> StructuredModels:
-    """The models with parameters of a point that its record does not tell.
-
-    As those of a mode that vanishes there: they may be anything, and a curve through
-    all points would follow them. What the others foresee is taken where it is more
-    certain, by what they miss when they are left out, than the point's own standard
-    deviation, and where with it the model is what the record does tell. Told.
-    """
-    kappa, n = found.points.kappa, len(found.theta)
-    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    usual = np.median(std, axis=0)
-    some = (usual > 0.0) & np.isfinite(usual)
-    ratio = np.divide(std, usual, out=np.zeros_like(std), where=some)
-    # but for a record that tells less of all parameters: covariances weigh that
-    least = ratio.min(axis=1, initial=np.inf, keepdims=True)
-    doubted = ratio > _UNTOLD * np.maximum(least, 1.0)
-    doubtful: NDArray[np.bool_] = doubted.any(axis=1)
-    rest = np.flatnonzero(~doubtful)
-    enough = n > len(rest) >= max(_FORESEEING, n - n // 3)
-    if np.isnan(std).any() or not enough:
-        return found
-    form, others = AutoLPV(), found.theta[rest]
-    left_out = values_left_out(form, kappa[rest], others, found.covariance[rest])
-    missed = [values - others[out] for out, values in left_out]
-    places = kappa[doubtful]
-    foreseen = interpolated_without(
-        doubtful, form, kappa, found.theta, places, found.covariance
-    )
-    if not missed or foreseen is None:
-        return found
-    scatter = np.maximum(np.sqrt(np.mean(np.vstack(missed) ** 2, axis=0)), usual)
-    low, high = kappa[rest].min(axis=0), kappa[rest].max(axis=0)
-    theta, covariance = found.theta.copy(), found.covariance.copy()
-    models, told, worst = list(found.models), [], 0.0
-    names = np.array(found.structure.parameter_names, dtype=object)
-
-    def away(k: int, own: Array, taken: Any) -> tuple[float, Array, StateSpace]:
-        """How far a model of which some values are foreseen is from the record's."""
-        row = np.where(taken, own, found.theta[k])
-        row = np.clip(row, found.structure.lower, found.structure.upper)
-        (model,) = _delayed(found.structure, row[None], [found.local[k]])
-        error = largest_difference(model, found.local[k].lti)
-        return (error if model.is_stable else np.inf), row, model
-
-    for k, own in zip(np.flatnonzero(doubtful).tolist(), foreseen, strict=True):
-        untold = doubted[k] & (std[k] > scatter)
-        if not (untold.any() and ((low <= kappa[k]) & (kappa[k] <= high)).all()):
-            continue
-        # where one is anything, others may be, with a deviation that is none
-        astray = untold | (np.abs(own - theta[k]) > _ASTRAY * scatter)
-        mode = untold.copy()  # a mode vanishes as a whole: what no longer matters, too
-        for j in np.flatnonzero(astray & ~untold):
-            more = mode.copy()
-            more[j] = True
-            if away(k, own, more)[0] < away(k, own, mode)[0] + _LIKE:
-                mode = more
-        for taken, most in ((astray, _LIKE), (mode, NEAR), (untold, NEAR)):
-            error, row, model = away(k, own, taken)
-            if not error < most:
-                continue
-            theta[k], models[k], worst = row, model, max(worst, error)
-            P = np.where(taken | taken[:, None], 0.0, covariance[k])
-            covariance[k] = P + np.diag(np.where(taken, scatter, 0.0) ** 2)
-            what = ", ".join(map(repr, names[taken]))
-            told.append(f"{what} at {place_of(k, kappa)}")
-            break
-    if told:
-        warn(
-            f"the record does not tell {'; '.join(told)}, as where a mode vanishes: "
-            "the LPV model takes what the other points foresee there instead. Within "
-            f"{100.0 * worst:.2g} % of the largest gain it is what the record does "
-            "tell. Give values or bounds of these parameters if they are known."
-        )
-    return found._replace(theta=theta, covariance=covariance, models=models)
-
-
-def mirror_images(found: StructuredModels) -> list[StructuredModels]:
-    """The models, and those with parts interchanged at all points, if others over them.
-
-    These have the same responses at every point, and nothing known before tells them
-    apart; where the scheduling variables move they differ. Takes back what was told of
-    that at the points.
-    """
-    mirrored, others = [found], _images(found)[0]
-    if len(others):
-        take_back(INTERCHANGE)
-    for places in others:
-        theta = found.theta[:, places]
-        models = _delayed(found.structure, theta, found.local)
-        covariance = found.covariance[:, places[:, None], places]
-        fits = [fitted.interchanged(places) for fitted in found.restructurers]
-        mirrored.append(
-            found._replace(
-                theta=theta, covariance=covariance, models=models, restructurers=fits
-            )
-        )
-    return mirrored
-
-
-def _images(
-    found: StructuredModels, family: Array | None = None
-) -> tuple[NDArray[np.intp], Array]:
-    """Interchanges that make another LPV model, and how much: the most first."""
-    structure, fits = found.structure, found.restructurers
-    none = np.zeros((0, structure.n_params), dtype=np.intp), np.zeros(0)
-    if len(found.theta) < 2 or not all(hasattr(f, "interchanged") for f in fits):
-        return none
-    places = interchanges(structure) if fits else none[0]
-    if len(places) < 2:
-        return none
-    theta = found.theta if family is None else family
-    known = known_before(structure, getattr(fits[0], "init", None))
-    places = places[as_plausible(structure, theta, places, known)][:_IMAGES]
-    try:
-        change = told_by_motion(structure, theta, places)
-    except (ValueError, np.linalg.LinAlgError):  # no such model, or no Gramians
-        return none
-    order = np.argsort(-change, kind="stable")
-    order = order[change[order] > _ANOTHER]
-    return places[order], change[order]
-
-
-def tell_of_mirror_images(found: StructuredModels, model: LPVStateSpace) -> None:
-    """Tell of parts whose interchange is another LPV model of the same responses."""
-    q = found.structure.n_params
-    if any(fitted.identifiability_.rank < q for fitted in found.restructurers):
-        return  # these are told
-    family = model.silenced().parameters(found.points.kappa)
-    places, change = _images(found, family)
-    if not (change > _TOLD).any():
-        return
-    take_back(INTERCHANGE)
-    moved = (places[change > _TOLD] != np.arange(places.shape[1])).any(axis=0)
-    names = [found.structure.parameter_names[j] for j in np.flatnonzero(moved)]
-    warn(
-        f"the values of {', '.join(map(repr, names))} may be those of one another at "
-        "all operating points: no response there tells these parts of the structure "
-        "apart, but where the scheduling variables move they make another LPV model, "
-        "and this one may be wrong. Give experiments that move, with refiner="
-        "OutputErrorLPV(), which decide; or say which is which by "
-        "structure.with_bounds(), structure.with_ranges(), or a first guess, "
-        "GrayBoxRestructurer(structure, init=...)."
-    )
 
 
 def without_structure(
@@ -372,13 +207,13 @@ def without_structure(
         sampling_time * points.n_longest,
         auto,
     )
-    models = _delayed(found.structure, found.theta, local)
+    models = delayed_models(found.structure, found.theta, local)
     canonical = StructuredModels(points, local, *found, models, [], auto)
     ways = [canonical, aligned] if better else [aligned, canonical]
     return ways if every or better else ways[:1]
 
 
-def _delayed(
+def delayed_models(
     structure: GrayBoxStructure, theta: Array, local: Sequence[LocalModel]
 ) -> list[StateSpace]:
     """Models of a structure with the delays of the local ones."""

@@ -34,9 +34,9 @@ from ...subspace.telling import unheard
 from ..checks.error_warnings import CONSTANT
 from ..checks.stability import grows
 from ..one_basis.black_boxes import balanced_entries
+from ..one_basis.mirror_images import mirror_images
 from ..one_basis.structured_models import (
     StructuredModels,
-    mirror_images,
     over_points,
     restructure_points,
     without_structure,
