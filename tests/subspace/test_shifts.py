@@ -15,11 +15,8 @@ from lpvlearn.subspace.alternatives.shifts import (
     cut_at,
     find_shifts,
 )
-from lpvlearn.subspace.closed_loop.varx import (
-    find_feedback,
-    longest_past,
-    regression_of,
-)
+from lpvlearn.subspace.closed_loop.feedback import find_feedback
+from lpvlearn.subspace.closed_loop.varx import longest_past, regression_of
 from lpvlearn.subspace.fits.one_fit import Samples
 from lpvlearn.subspace.samples.records import Record
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ...data.preparation import Pairs
 from ...systems.modes import lasting, mode_rates, n_changes
-from ..closed_loop.varx import find_feedback
+from ..closed_loop.feedback import find_feedback
 from ..evidence.constants import ALIKE, CERTAIN, motion_left, with_levels
 from ..evidence.offsets import Offsets, attributed
 from ..evidence.residuals import lacks

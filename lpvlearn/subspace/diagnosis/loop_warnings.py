@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..alternatives.rivals import Doubt
-from ..closed_loop.varx import Feedback
+from ..closed_loop.feedback import Feedback
 from ..fits.local_fit import LocalFit
 from ..fits.options import Choices
 from ..telling import Telling

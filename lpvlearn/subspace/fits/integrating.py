@@ -22,7 +22,8 @@ from ...data.experiments import Experiment
 from ...exceptions import warn
 from ...models.statespace import DEVIATION, ModelPair, StateSpace
 from ...validation import has_one_axis, is_whole, shown
-from ..closed_loop.varx import Feedback, direct_terms, find_feedback
+from ..closed_loop.feedback import Feedback, find_feedback
+from ..closed_loop.varx import direct_terms
 from ..evidence.constants import USELESS
 from ..evidence.statistics import Evidence
 from ..samples.records import scale_records

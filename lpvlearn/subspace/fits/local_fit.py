@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...data.preparation import DETRENDS
-from ..closed_loop.varx import Feedback
+from ..closed_loop.feedback import Feedback
 from ..evidence.offsets import Offsets
 from ..evidence.statistics import Evidence
 from ..orders.identification import Candidate, Settings

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ...data.preparation import Pairs, independent_inputs
 from ...exceptions import RankWarning
+from ..closed_loop.feedback import Feedback, find_feedback
 from ..closed_loop.pbsid import identify_closed_loop
 from ..closed_loop.plant_and_noise import ClosedLoopEvidence
-from ..closed_loop.varx import Feedback, find_feedback
 from ..evidence.constants import with_levels, without_slow_modes
 from ..evidence.offsets import attributed
 from ..evidence.statistics import Evidence

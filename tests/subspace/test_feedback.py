@@ -8,7 +8,8 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.closed_loop.varx import find_feedback, longest_past, past_window
+from lpvlearn.subspace.closed_loop.feedback import find_feedback
+from lpvlearn.subspace.closed_loop.varx import longest_past, past_window
 from lpvlearn.subspace.samples.records import Record
 
 from ..conftest import stable_model
