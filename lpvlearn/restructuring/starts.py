@@ -567,7 +567,7 @@ def known_signs(structure: GrayBoxStructure) -> Array:
     """Signs that bounds or ranges tell, (n_params,): -1 or 1; 0 where nothing does."""
     lower, upper, ranges = structure.lower, structure.upper, structure.ranges
     known = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
-    below = (upper <= 0) | (ranges[0] < 0)
+    below = (upper <= 0) | ((ranges[0] < 0) & (lower < 0))
     return np.where(known, np.where(below, -1.0, 1.0), 0.0)
 
 

@@ -24,6 +24,7 @@ from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.one_basis.foreseen_parameters import with_foreseen
 from lpvlearn.pipeline.one_basis.structured_models import (
     StructuredModels,
+    _tell_of_no_deviations,
     covariance_of_parameters,
     restructure_points,
 )
@@ -541,3 +542,11 @@ def test_what_all_records_tell_is_left_alone():
     assert with_foreseen(known) is known
     unknown = true._replace(covariance=np.full_like(true.covariance, np.nan))
     assert with_foreseen(unknown) is unknown
+
+
+def test_points_without_deviations_are_told_beside_others():
+    kappa, known = np.arange(3.0)[:, None], np.eye(2)
+    with pytest.warns(UserWarning, match="not known at operating point 1 .scheduling"):
+        _tell_of_no_deviations([known, None, known], kappa)
+    for same in ([None, None, None], [known, known, known]):  # a warning is an error
+        _tell_of_no_deviations(same, kappa)

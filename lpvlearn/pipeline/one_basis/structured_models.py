@@ -33,6 +33,7 @@ from ...restructuring.problem import GOOD_FIT, problem_from_models
 from ...restructuring.uncertainty import ParameterUncertainty
 from ...structures.structure import GrayBoxStructure
 from ...systems.beginnings import Beginning, begin_held, waiting
+from ...validation import listed
 from ..points.local_models import LocalModel
 from ..running.runner import Done, PointRunner, place_of, tell_skipped
 from .black_boxes import (
@@ -53,6 +54,8 @@ _SWEEPS = 4  # passes over the points: help travels that far from a good one
 _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
 _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
+
+_NAMED = 3  # points in a message; of more the number is enough
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -150,10 +153,25 @@ def restructure_points(
     for P, known in zip(covariance, covariances, strict=True):
         if known is not None:
             P[:] = known
+    _tell_of_no_deviations(covariances, points.kappa)
     models = [fitted.lti_ for fitted in helped]
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _tell_of_no_deviations(known: Sequence[Array | None], kappa: Array) -> None:
+    """Tell of points whose parameters have no deviations, where those of others do."""
+    lacking = [k for k, P in enumerate(known) if P is None]
+    if lacking and len(lacking) < len(known):
+        places = listed([place_of(k, kappa) for k in lacking], _NAMED)
+        warn(
+            f"the standard deviations of the parameters are not known at {places}: the "
+            "local models have none there, as in a loop whose noise takes more states "
+            "than they have. The parameters are the H-infinity optimum, and the "
+            "interpolation does not know how far to trust them. Use `local` with "
+            "another `order`, or record for longer there."
+        )
 
 
 def _black_boxes(
