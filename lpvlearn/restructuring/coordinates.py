@@ -29,6 +29,7 @@ from .similarity import (
     mean_rate,
     nearest_parameters,
     scaled_problem,
+    transformed,
 )
 
 Array = NDArray[np.float64]
@@ -337,20 +338,16 @@ class CanonicalForm:
             return None
         T = np.linalg.lstsq(M, b, rcond=None)[0].reshape(n, n)
         try:
-            inverse = np.linalg.inv(T)
+            d = transformed(problem, T[None])[0]
         except np.linalg.LinAlgError:
             return None
-        new = np.block(
-            [[T @ problem.A @ inverse, T @ problem.B], [problem.C @ inverse, problem.D]]
-        )
-        d = new - problem.offset
         flat = problem.basis.reshape(structure.n_params, -1)
         if (np.count_nonzero(flat, axis=0) <= 1).all():
             # of their own entries, however much larger others are
-            theta = flat @ d.ravel() / np.sum(flat**2, axis=1)
+            theta = flat @ d[0] / np.sum(flat**2, axis=1)
         else:
-            theta = nearest_parameters(problem, d.reshape(1, -1))[0]
-        rest = d - np.tensordot(theta, problem.basis, axes=1)
+            theta = nearest_parameters(problem, d)[0]
+        rest = d[0] - theta @ flat
         near = np.linalg.norm(rest) <= exact * np.linalg.norm(d)
         return theta if near else None
 

@@ -64,6 +64,11 @@ class Target:
         return cls(*blocks(S, order), dt)
 
     @property
+    def matrices(self) -> tuple[Array, Array, Array, Array]:
+        """A, B, C and D."""
+        return self.A, self.B, self.C, self.D
+
+    @property
     def system_matrix(self) -> Array:
         """``[[A, B], [C, D]]``."""
         return np.block([[self.A, self.B], [self.C, self.D]])
@@ -71,8 +76,7 @@ class Target:
     def repeated(self, copies: int) -> Target:
         """The model side by side, once for every channel: block-diagonal."""
         eye = np.eye(copies)
-        parts = (self.A, self.B, self.C, self.D)
-        A, B, C, D = (np.asarray(np.kron(eye, M), dtype=float) for M in parts)
+        A, B, C, D = (np.asarray(np.kron(eye, M), float) for M in self.matrices)
         return Target(A, B, C, D, self.dt)
 
 
@@ -107,20 +111,15 @@ def model_derivatives(model: Target, omega: Array) -> tuple[Complex, Complex, Co
     return model.C @ PB + model.D, first, second
 
 
-def series(
-    A: Array, B: Array, C: Array, D: Array, weight: Target
-) -> tuple[Array, Array, Array, Array]:
+def series(model: Target, weight: Target) -> Target:
     """Realisation of the weight after a model."""
-    n, k = len(A), len(weight.A)
-    As = np.zeros((n + k, n + k))
-    As[:n, :n], As[n:, n:] = A, weight.A
-    As[n:, :n] = weight.B @ C
-    return (
-        As,
-        np.vstack([B, weight.B @ D]),
-        np.hstack([weight.D @ C, weight.C]),
-        weight.D @ D,
-    )
+    n, k = len(model.A), len(weight.A)
+    A = np.zeros((n + k, n + k))
+    A[:n, :n], A[n:, n:] = model.A, weight.A
+    A[n:, :n] = weight.B @ model.C
+    B = np.vstack([model.B, weight.B @ model.D])
+    C = np.hstack([weight.D @ model.C, weight.C])
+    return Target(A, B, C, weight.D @ model.D, model.dt)
 
 
 def frequency_grid(poles: NDArray, dt: float | None) -> Array:
@@ -303,21 +302,23 @@ class ErrorSystem:
         """
         key, depth = theta.tobytes(), -1.0 if within is None else within
         if self._met is None or self._met[0] != key or self._met[1] < depth:
-            found = linf_norm(*self.realisation(theta), dt=self.dt, within=within)
+            parts = self.realisation(theta).matrices
+            found = linf_norm(*parts, dt=self.dt, within=within)
             self._met = key, depth, found
         found, count = self._met[2], 1
         if within is not None:
             count = int((found.values >= (1.0 - within) * found.norm).sum())
         return PeakSet(found.norm, found.frequencies[:count], found.values[:count])
 
-    def realisation(self, theta: Array) -> tuple[Array, Array, Array, Array]:
-        """Matrices of the error: states of the gray box, the target, the weight."""
+    def realisation(self, theta: Array) -> Target:
+        """The error as a model: states of the gray box, the target, the weight."""
         g, t, n = self.model(theta), self.target, self.n
         N = n + len(t.A)
         Ae = np.zeros((N, N))
         Ae[:n, :n], Ae[n:, n:] = g.A, t.A
-        parts = Ae, np.vstack([g.B, t.B]), np.hstack([g.C, -t.C]), g.D - t.D
-        return parts if self.weight is None else series(*parts, self.weight)
+        B, C = np.vstack([g.B, t.B]), np.hstack([g.C, -t.C])
+        error = Target(Ae, B, C, g.D - t.D, self.dt)
+        return error if self.weight is None else series(error, self.weight)
 
     def restructured(self, structure: Structure) -> ErrorSystem:
         """The error of another structure of that order."""
@@ -328,9 +329,7 @@ class ErrorSystem:
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""
         if self.weight is not None:
-            old, new = self.weight, weight.repeated(self.n_outputs)
-            total = series(old.A, old.B, old.C, old.D, new)
-            weight = Target(*total, weight.dt)
+            weight = series(self.weight, weight.repeated(self.n_outputs))
         return ErrorSystem(self.structure, self.target, weight)
 
     def _weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:

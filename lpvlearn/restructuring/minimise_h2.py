@@ -46,7 +46,7 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
     """
     structure, n, p, w = system.structure, system.n, system.n_outputs, system.weight
     N = n + len(system.target.A)
-    As, Bs, Cs, Ds = system.realisation(theta)
+    As, Bs, Cs, Ds = system.realisation(theta).matrices
     continuous = system.dt is None
     P, Q = _gramian(As, Bs, continuous), _gramian(As.T, Cs.T, continuous)
     if continuous:

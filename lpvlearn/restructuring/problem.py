@@ -350,10 +350,8 @@ def problem_from_models(
     if len(boxes) > 1:
         target, matched = _stacked(boxes), structure.with_stacked_outputs(len(boxes))
     system = ErrorSystem(matched, target, behind)
-    parts = (target.A, target.B, target.C, target.D)
-    if system.weight is not None:
-        parts = series(*parts, system.weight)
-    reference = hinf_norm(*parts, dt=dt).norm
+    weighted = target if system.weight is None else series(target, system.weight)
+    reference = hinf_norm(*weighted.matrices, dt=dt).norm
     _check_size(reference)
     omega = system.grid if division is None else division.apart(system.grid)
     bound = 0.0
@@ -609,9 +607,9 @@ def _band(edges: Any) -> StateSpace:
             f"`frequency_weight` must be a band with 0 <= low < high. Got {edges!r}."
         )
     one = np.ones((1, 1))
-    parts = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), one
+    band = Target(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), one)
     if low > 0:
-        parts = series(*parts, Target(-low * one, low * one, -one, one))
+        band = series(band, Target(-low * one, low * one, -one, one))
     if np.isfinite(high):
-        parts = series(*parts, Target(-high * one, high * one, one, 0.0 * one))
-    return StateSpace(*parts)
+        band = series(band, Target(-high * one, high * one, one, 0.0 * one))
+    return StateSpace(*band.matrices)

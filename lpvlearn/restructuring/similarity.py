@@ -59,10 +59,7 @@ _ROUNDING = 1e-24  # squared distance, relative to the structure: it is reached 
 class AffineProblem:
     """An affine structure beside a black box of the same order, time-scaled."""
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    box: Target
     offset: Array  # (n + p, n + m)
     basis: Array  # (q, n + p, n + m)
 
@@ -104,10 +101,7 @@ def scaled_problem(
     left = np.concatenate([1.0 / (s * rate), np.ones(p)])
     right = np.concatenate([s, np.ones(m)])
     return AffineProblem(
-        box.A / rate,
-        box.B / rate,
-        box.C,
-        box.D,
+        Target(box.A / rate, box.B / rate, box.C, box.D, box.dt),
         left[:, None] * offset * right,
         left[:, None] * basis * right,
     )
@@ -115,7 +109,7 @@ def scaled_problem(
 
 def linear_equations(problem: AffineProblem) -> tuple[Array, Array]:
     """Equations ``M vec(T) = b`` (row-major) from what holds no parameter."""
-    n, m, p = len(problem.A), problem.B.shape[1], problem.C.shape[0]
+    n, m, p = len(problem.box.A), problem.box.B.shape[1], problem.box.C.shape[0]
     free = (problem.basis != 0).any(0)
     S, eye = problem.offset, np.eye(n)
     M: list[Array] = [np.zeros((0, n * n))]
@@ -123,16 +117,16 @@ def linear_equations(problem: AffineProblem) -> tuple[Array, Array]:
     for i in range(n):
         row = eye[i : i + 1]
         if not free[i, :n].any():  # e_i T A - S_i T = 0
-            M.append(np.kron(row, problem.A.T) - np.kron(S[i : i + 1, :n], eye))
+            M.append(np.kron(row, problem.box.A.T) - np.kron(S[i : i + 1, :n], eye))
             b.append(np.zeros(n))
         for j in range(m):
             if not free[i, n + j]:  # e_i T b_j = S_ij
-                M.append(np.kron(row, problem.B[:, j : j + 1].T))
+                M.append(np.kron(row, problem.box.B[:, j : j + 1].T))
                 b.append(S[i : i + 1, n + j])
     for k in range(p):
         if not free[n + k, :n].any():  # S_k T = c_k
             M.append(np.kron(S[n + k : n + k + 1, :n], eye))
-            b.append(problem.C[k])
+            b.append(problem.box.C[k])
     return np.vstack(M), np.concatenate(b)
 
 
@@ -146,7 +140,7 @@ def similarity_starts(
     Returns them (n_found, n_params) and the distances to the structure that remain,
     ascending.
     """
-    n = len(problem.A)
+    n = len(problem.box.A)
     M, b = linear_equations(problem)
     T0 = np.linalg.lstsq(M, b, rcond=None)[0] if len(b) else np.zeros(n * n)
     N = null_space(M, rcond=_NULL_TOLERANCE) if len(b) else np.eye(n * n)
@@ -178,7 +172,7 @@ def similarity_starts(
     Z, cost = Z[np.isfinite(cost)], cost[np.isfinite(cost)]  # regular ones
     if len(Z) == 0:
         return np.zeros((0, len(flat))), cost
-    d = _transformed(problem, (T0 + Z @ N.T).reshape(-1, n, n))[0]
+    d = transformed(problem, (T0 + Z @ N.T).reshape(-1, n, n))[0]
     if nearest:
         rest = d - (d @ directions) @ directions.T
         cost = np.einsum("ij,ij->i", rest, rest)
@@ -209,14 +203,14 @@ def _own_rank(problem: AffineProblem) -> int:
     Of one with random parameters, as of all but special ones. That of all unknowns
     where no input moves it, or no output shows it: it is similar to no black box.
     """
-    n = len(problem.A)
+    n = len(problem.box.A)
     size = np.abs(problem.basis).max((1, 2), initial=0.0)
     rng = np.random.default_rng(0)
     theta = rng.normal(size=len(size)) / np.where(size > 0, size, 1.0)
     S = problem.offset + np.tensordot(theta, problem.basis, axes=1)
     if not (S[:n, n:].any() and S[n:, :n].any()):
         return n * n
-    own = replace(problem, A=S[:n, :n], B=S[:n, n:], C=S[n:, :n])
+    own = replace(problem, box=Target.of(S, n, None))
     M = _of_length_one(*linear_equations(own))[0]
     return int(np.linalg.matrix_rank(M, rtol=_NULL_TOLERANCE))
 
@@ -237,7 +231,7 @@ def _nearest_solutions(M: Array, b: Array, rank: int) -> tuple[Array, Array]:
 
 def _in_equations(problem: AffineProblem) -> NDArray[np.bool_]:
     """The entries of the system matrix that the linear equations hold."""
-    n = len(problem.A)
+    n = len(problem.box.A)
     held = ~(problem.basis != 0).any(0)
     held[:, :n] = held[:, :n].all(1, keepdims=True)
     held[n:, n:] = False
@@ -252,15 +246,15 @@ def nearest_parameters(problem: AffineProblem, d: Array) -> Array:
     return np.asarray((np.linalg.lstsq((flat / size).T, d.T, rcond=None)[0] / size).T)
 
 
-def _transformed(problem: AffineProblem, T: Array) -> tuple[Array, Array, Array]:
+def transformed(problem: AffineProblem, T: Array) -> tuple[Array, Array, Array]:
     """Stacked ``[T A T^-1, T B; C T^-1, D] - offset``, the matrices, and T^-1."""
-    n = len(problem.A)
+    n = len(problem.box.A)
     inverse = np.linalg.inv(T)
     S = np.empty((len(T), *problem.offset.shape))
-    S[:, :n, :n] = T @ problem.A @ inverse
-    S[:, :n, n:] = T @ problem.B
-    S[:, n:, :n] = problem.C @ inverse
-    S[:, n:, n:] = problem.D
+    S[:, :n, :n] = T @ problem.box.A @ inverse
+    S[:, :n, n:] = T @ problem.box.B
+    S[:, n:, :n] = problem.box.C @ inverse
+    S[:, n:, n:] = problem.box.D
     return (S - problem.offset).reshape(len(T), -1), S, inverse
 
 
@@ -272,7 +266,7 @@ def _distances(
     With ``Delta = N_l T^-1``: ``dA = Delta A - A Delta``, ``dB = Delta B``,
     ``dC = -C Delta`` for the transformed matrices.
     """
-    n = len(problem.A)
+    n = len(problem.box.A)
 
     def rest(d: Array) -> Array:
         return d - (d @ directions) @ directions.T
@@ -282,7 +276,7 @@ def _distances(
         r = np.full((len(T), problem.offset.size), np.nan)
         good = np.asarray(np.isfinite(T).all((1, 2)), dtype=bool)
         good[good] = np.abs(np.linalg.det(T[good])) > 0
-        d, S, inverse = _transformed(
+        d, S, inverse = transformed(
             problem, np.where(good[:, None, None], T, np.eye(n))
         )
         r[good] = rest(d[good])
@@ -339,8 +333,7 @@ class _BilinearEquations:
         self.rate = 1.0 if discrete else max(float(poles.max(initial=0.0)), 1e-300)
         basis = structure.jacobian(theta)
         problem = scaled_problem(box, offset, basis, self.rate)
-        self.offset, self.basis = problem.offset, problem.basis
-        self.box = Target(problem.A, problem.B, problem.C, problem.D, box.dt)
+        self.box, self.offset, self.basis = problem.box, problem.offset, problem.basis
         self.S0 = self.box.system_matrix
         self.n, (self.p, self.m) = structure.order, box.D.shape
 

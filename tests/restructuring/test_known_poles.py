@@ -174,7 +174,7 @@ def test_the_error_beside_an_oscillator_is_the_norm_of_the_weighted_difference()
     """With c the frequency of the pair, which is nearer than the other poles."""
     box = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
     quick = target_of(StateSpace([[-1e3]], [[1.2e3]], [[1.0]]))
-    box = StateSpace(*series(box.A, box.B, box.C, box.D, quick))
+    box = StateSpace(*series(target_of(box), quick).matrices)
     fitted = GrayBoxRestructurer(OSCILLATOR).fit_model(box)
     omega = np.geomspace(1e-3, 1e5, 4000)
     error = fitted.lti_.frequency_response(omega) - box.frequency_response(omega)
