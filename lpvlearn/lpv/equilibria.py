@@ -423,7 +423,7 @@ def _tell_missed(
     k = max(shares, key=lambda k: float(shares[k].max()))
     i = int(shares[k].argmax())
     if shares[k][i] > _MISSED:
-        names = points.models[k].output_names or range(len(y_scale))
+        names = points.models[k].output_names or range(1, len(y_scale) + 1)
         warn(
             "equilibria between the operating points are a guess: without point "
             f"{k} (scheduling {points.kappa[k, 0]:.4g}) the others miss output "

@@ -442,5 +442,5 @@ def test_points_that_no_curve_foresees_are_told():
     smooth = interpolated(spline, FEED, values, first_order, scales, tell=True)
     assert_allclose(smooth.predict(FEED + 0.5)[:4, 0], FEED[:4, 0] + 0.5)
     values[2, 0] += 30.0
-    with pytest.warns(UserWarning, match="miss output 0 at rest by .* Measure in"):
+    with pytest.warns(UserWarning, match="miss output 1 at rest by .* Measure in"):
         interpolated(spline, FEED, values, first_order, scales, tell=True)
