@@ -108,7 +108,7 @@ def output_slopes(
     size = max(_FEWEST, _ENTRIES // ((n + model.n_outputs) * (n + len(free))))
     for start in range(0, len(u), size):
         rows = slice(start, min(start + size, len(u)))
-        A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit, moved_by)
+        A, B, C, E = _linearised(model, kappa[rows], rates[rows], unit, moved_by)
         offset = model.state_offset(kappa[rows]) / unit
         w, dw = late[rows], change[rows]
         n_steps = _steps_of(_norm(A) * dt)
@@ -165,7 +165,7 @@ def _slopes_of_beginning(
     n, rates = model.order, np.zeros_like(kappa)
     if not w.any():
         return np.zeros((n, int(free.sum())))
-    A, B, _, _, E = _linearised(model, kappa, rates, unit, moved_by)
+    A, B, _, E = _linearised(model, kappa, rates, unit, moved_by)
     x = -np.linalg.solve(A[0], B[0] @ w)
     moved = _directed(E[..., :n, :], np.concatenate([x, w])[None])
     slopes = np.asarray(-np.linalg.solve(A, moved), dtype=float)
@@ -178,8 +178,8 @@ def _linearised(
     rates: Array,
     unit: Array,
     moved_by: NDArray[np.intp],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Matrices in units of the states, and the directions of S.
+) -> tuple[Array, Array, Array, Array]:
+    """A, B and C in units of the states, and the directions of S.
 
     Directions (..., n_directions, n + n_outputs, n + n_inputs): those of the
     parameters, and the entries of A that rate terms change.
@@ -202,7 +202,7 @@ def _linearised(
         E = np.concatenate([E, entries], axis=-3)
     rows = np.concatenate([unit, np.ones(structure.n_outputs)])[:, None]
     columns = np.concatenate([unit, np.ones(structure.n_inputs)])
-    return *blocks(S / rows * columns, n), E / rows * columns
+    return *blocks(S / rows * columns, n)[:3], E / rows * columns
 
 
 def _moving_entries(model: LPVStateSpace, free: Flags) -> NDArray[np.intp]:
