@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..exceptions import VersionedPickle
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
+from ..systems.least_squares import row_and_column_scales
 from ..validation import flag, place
 from .coefficients import MatrixCoefficients
 
@@ -27,8 +28,6 @@ Array = NDArray[np.float64]
 
 # Directions this much weaker than coefficients, which are scaled to one, are rounding.
 _RANK = 1e-12
-
-_SCALING_PASSES = 16  # over rows and columns: each divides a size, in decades, by four
 
 # Least singular value of the change to variables as they are, relative to what it
 # adds: half of the digits are lost. (Far from zero, in units of its range, a variable
@@ -128,7 +127,7 @@ def linear_fractional(
     upper, lower = np.concatenate([c.A, c.B], 2), np.concatenate([c.C, c.D], 2)
     S, d = np.concatenate([upper, lower], 1), c.denominator
     S, d = S / d[0], d / d[0]
-    rows, columns = scales(S - d[:, None, None] * S[0])  # what varies
+    rows, columns = row_and_column_scales(S - d[:, None, None] * S[0])  # what varies
     S = S / rows[:, None] / columns
     n = c.powers.shape[1]
     orders = list(permutations(range(n))) if n <= _MANY_VARIABLES else [tuple(range(n))]
@@ -154,18 +153,6 @@ def linear_fractional(
         c.scheduling_names,
         c.input_delay,
     )
-
-
-def scales(terms: Array) -> tuple[Array, Array]:
-    """Sizes of rows and columns that bring what varies near to one."""
-    size = np.abs(terms).max(axis=0, initial=0.0)
-    scales = [np.ones(length) for length in size.shape]
-    for _ in range(_SCALING_PASSES):
-        for axis in (0, 1):
-            left = size / scales[0][:, None] / scales[1]
-            largest = left.max(axis=1 - axis, initial=0.0)
-            scales[axis] *= np.sqrt(np.where(largest > 0, largest, 1.0))
-    return scales[0], scales[1]
 
 
 def _chains(

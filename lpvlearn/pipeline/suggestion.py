@@ -12,11 +12,11 @@ from sklearn.utils.validation import check_is_fitted
 
 from ..data.operating_points import neighbours
 from ..lpv.left_out import interpolated_without
-from ..lpv.lfr import scales
 from ..lpv.weighting import covariance_factor
 from ..metrics.scorers import unwrapped
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace, scaled
+from ..systems.least_squares import row_and_column_scales
 from ..validation import one_of
 from .estimator import LocalLPVPipeline
 
@@ -166,4 +166,4 @@ def _units(models: Sequence[StateSpace]) -> tuple[Array, Array]:
     omega = omega[omega > 0] if (omega > 0).any() else np.ones(1)
     gains = np.abs([model.frequency_response(omega) for model in models])
     largest = np.where(np.isfinite(gains), gains, 0.0).max(axis=(0, 1))
-    return scales(largest[None])
+    return row_and_column_scales(largest[None])

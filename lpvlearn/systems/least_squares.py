@@ -19,6 +19,8 @@ RCOND = 1e-11
 
 _LARGEST_BLOCK = 64  # columns that LAPACK's QR works on at a time, at most
 
+_SCALING_PASSES = 16  # over rows and columns: each divides a size, in decades, by four
+
 # Marquardt's damping, relative to the squared lengths of the Jacobian's columns
 _FIRST_DAMPING = 1e-3  # nearly Gauss-Newton: starts that need more soon have it
 _LEAST_DAMPING = 1e-12  # below, it is rounding noise beside the squared columns
@@ -96,6 +98,18 @@ def diagonal_scale(matrix: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
     scale[scale == 0.0] = 1.0
     return scale
+
+
+def row_and_column_scales(terms: Array) -> tuple[Array, Array]:
+    """Sizes of rows and columns that bring what varies near to one."""
+    size = np.abs(terms).max(axis=0, initial=0.0)
+    scales = [np.ones(length) for length in size.shape]
+    for _ in range(_SCALING_PASSES):
+        for axis in (0, 1):
+            left = size / scales[0][:, None] / scales[1]
+            largest = left.max(axis=1 - axis, initial=0.0)
+            scales[axis] *= np.sqrt(np.where(largest > 0, largest, 1.0))
+    return scales[0], scales[1]
 
 
 # Residuals (k, n_residuals) of some rows of the stack of starts, not finite where a
