@@ -51,6 +51,7 @@ from .fit_warnings import (
     tell_of_poor_fit,
     tell_of_search,
 )
+from .frequency_weight import FrequencyWeight
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import (
@@ -64,7 +65,6 @@ from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
     CLEAN_FIT,
-    FrequencyWeight,
     RestructuringProblem,
     problem_from_models,
     problem_from_response,

@@ -23,6 +23,7 @@ from ..validation import weights
 from .coordinates import CanonicalForm, View
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
+from .frequency_weight import weight_model
 from .known_poles import Division, divide
 from .least_squares import (
     LeastSquaresResult,
@@ -36,13 +37,11 @@ from .measured import (
     MeasuredErrorSystem,
     read_frequency_data,
     read_noise,
-    stable_realization,
 )
+from .realization import stable_realization
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-FrequencyWeight = StateSpace | Sequence[float | None] | None
 
 GOOD_FIT = 3e-3  # relative least-squares error that a wrong basin seldom comes down to
 EXACT_FIT = 1e-8  # and one that is rounding: nothing is better
@@ -340,7 +339,7 @@ def problem_from_models(
         boxes = [division.of(box) for box in boxes]
     for box in boxes:
         _check_stable(box)
-    filter_ = _weight_model(weight, p, dt)
+    filter_ = weight_model(weight, p, dt)
     behind = None
     if filter_ is not None:
         behind = Target(filter_.A, filter_.B, filter_.C, filter_.D, dt)
@@ -503,7 +502,7 @@ def problem_from_response(
     p = structure.n_outputs
     grid, G = read_frequency_data(omega, frf, p, structure.n_inputs)
     W = np.broadcast_to(np.eye(p), (len(grid), p, p)).astype(complex)
-    filter_ = _weight_model(weight, p, None)
+    filter_ = weight_model(weight, p, None)
     if filter_ is not None:
         own = filter_.frequency_response(grid)
         W = own if own.shape == W.shape else own * W  # one for all outputs
@@ -553,63 +552,3 @@ def _check_finite(grid: Array, division: Division) -> None:
                 "must differ from the frequencies of oscillators without damping: the "
                 f"response is infinite there. Got {step.pole.imag:g}."
             )
-
-
-def _weight_model(
-    weight: Any, n_outputs: int, sampling_time: float | None
-) -> StateSpace | None:
-    """The `frequency_weight`, model or band, in the time domain of the black boxes."""
-    if weight is None:
-        return None
-    if not isinstance(weight, StateSpace):
-        weight = _band(weight)
-        if sampling_time is not None:
-            weight = weight.to_discrete(sampling_time, "tustin")
-    if weight.sampling_time != sampling_time:
-        raise ValueError(
-            "`frequency_weight` must be in the time domain of the model: sampling time "
-            f"{sampling_time}. Got {weight.sampling_time}."
-        )
-    if weight.input_delay.any():
-        raise ValueError(
-            f"`frequency_weight` must be without delay. Got {weight}. A delay changes "
-            "no gain: leave it out by with_input_delay(0)."
-        )
-    if not weight.is_stable:
-        raise ValueError(
-            "`frequency_weight` must be stable. Got a pole at "
-            f"{weight.poles()[np.argmax(weight.poles().real)]:.4g}."
-        )
-    if weight.D.shape not in ((1, 1), (n_outputs, n_outputs)):
-        raise ValueError(
-            f"`frequency_weight` must be 1 x 1 or {n_outputs} x {n_outputs}, for the "
-            f"outputs. Got {weight.n_outputs} x {weight.n_inputs}."
-        )
-    return weight
-
-
-def _band(edges: Any) -> StateSpace:
-    """First-order band-pass ``s / (s + low) * high / (s + high)``; rad/s.
-
-    None, 0 or infinity leaves that side open.
-    """
-    try:
-        low, high = edges
-        low = 0.0 if low is None else float(low)
-        high = np.inf if high is None else float(high)
-    except (TypeError, ValueError):
-        raise ValueError(
-            "`frequency_weight` must be a StateSpace or a band (low, high) in rad/s. "
-            f"Got {edges!r}."
-        ) from None
-    if not 0 <= low < high:
-        raise ValueError(
-            f"`frequency_weight` must be a band with 0 <= low < high. Got {edges!r}."
-        )
-    one = np.ones((1, 1))
-    band = Target(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), one)
-    if low > 0:
-        band = series(band, Target(-low * one, low * one, -one, one))
-    if np.isfinite(high):
-        band = series(band, Target(-high * one, high * one, one, 0.0 * one))
-    return StateSpace(*band.matrices)
