@@ -1,4 +1,4 @@
-"""Excitation signals and measurement noise of identification experiments."""
+"""Excitation signals and noisy tables of identification experiments."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.random import Generator, RandomState
 from numpy.typing import NDArray
 from sklearn.utils import check_random_state
@@ -112,17 +113,29 @@ def prbs(
     return amplitude * held[:, :n_samples].T
 
 
-def measurement_noise(
-    y: Array, snr_db: float, n_realizations: int, rng: Generator
-) -> Array:
-    """White noise (..., n_realizations, n_samples, n_outputs) for noise-free outputs.
+def experiment_tables(
+    inputs: dict[str, Array],
+    y: Array,
+    outputs: list[str],
+    dt: float,
+    snr_db: float,
+    n_repeats: int,
+    rng: Generator,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Experiments (n_experiments, n_samples, ...), each repeated with new white noise.
 
     For each output and experiment ``10 log10(cov(y_k) / cov(v_k)) = snr_db``, footnote
     5 of the paper; infinity is no noise.
     """
-    scale = y.std(axis=-2, keepdims=True) * 10.0 ** (-snr_db / 20.0)
-    shape = (*y.shape[:-2], n_realizations, *y.shape[-2:])
-    return scale[..., np.newaxis, :, :] * rng.standard_normal(shape)
+    n_experiments, n_samples, n_outputs = y.shape
+    scale = y.std(axis=1, keepdims=True) * 10.0 ** (-snr_db / 20.0)
+    draws = rng.standard_normal((n_experiments, n_repeats, n_samples, n_outputs))
+    noisy = (y[:, np.newaxis] + scale[:, np.newaxis] * draws).reshape(-1, n_outputs)
+    table = {k: np.repeat(v, n_repeats, axis=0).ravel() for k, v in inputs.items()}
+    n_labels = n_experiments * n_repeats
+    table["experiment"] = np.repeat(np.arange(n_labels), n_samples)
+    table["time"] = np.tile(np.arange(n_samples) * dt, n_labels)
+    return pd.DataFrame(table, copy=False), pd.DataFrame(noisy, columns=outputs)
 
 
 def spawn_generators(

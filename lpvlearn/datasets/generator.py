@@ -17,7 +17,7 @@ from .excitation import (
     check_rows,
     check_size,
     decibels,
-    measurement_noise,
+    experiment_tables,
     prbs,
     samples_of,
     spawn_generators,
@@ -239,11 +239,11 @@ def make_flexible_arm(
     def tables(
         rows: slice, length: int, n_repeats: int = 1, snr: float = np.inf
     ) -> tuple[pd.DataFrame, pd.DataFrame]:
-        y = response.y[rows, :length]
-        y = y[:, np.newaxis] + measurement_noise(y, snr, n_repeats, noise_rng)
-        kappa = response.kappa[rows, :length]
-        X = _input_table(references[rows, :length], kappa, n_repeats, sampling_time)
-        return X, pd.DataFrame(y.reshape(-1, 2), columns=OUTPUTS)
+        signals = [*np.moveaxis(references, 2, 0), response.kappa]
+        inputs = [signal[rows, :length] for signal in signals]
+        X = dict(zip([*INPUTS, "kappa"], inputs, strict=True))
+        y, dt = response.y[rows, :length], sampling_time
+        return experiment_tables(X, y, OUTPUTS, dt, snr, n_repeats, noise_rng)
 
     X, y = tables(slice(0, n_points), n_samples, n_repeats, snr_db)
     X_local, y_local = tables(slice(n_points, 2 * n_points), n_samples)
@@ -282,22 +282,6 @@ def describe_arm(
         "theta2": theta2,
         "analytic_models": [arm.linearize(angle) for angle in theta2],
     }
-
-
-def _input_table(
-    references: Array, kappa: Array, n_repeats: int, sampling_time: float
-) -> pd.DataFrame:
-    """One row a sample, the experiments below each other, each `n_repeats` times."""
-    n_experiments, n_samples = kappa.shape
-    n_labels = n_experiments * n_repeats
-    columns = [references[..., 0], references[..., 1], kappa]
-    table = {
-        name: np.repeat(column, n_repeats, axis=0).ravel()
-        for name, column in zip([*INPUTS, "kappa"], columns, strict=True)
-    }
-    table["experiment"] = np.repeat(np.arange(n_labels), n_samples)
-    table["time"] = np.tile(np.arange(n_samples) * sampling_time, n_labels)
-    return pd.DataFrame(table, copy=False)
 
 
 def _clock_samples(

@@ -25,7 +25,7 @@ from .excitation import (
     check_rows,
     check_size,
     decibels,
-    measurement_noise,
+    experiment_tables,
     prbs,
     samples_of,
     spawn_generators,
@@ -359,16 +359,8 @@ def make_unbalanced_disc(
         u: Array, start: ArrayLike, n_repeats: int = 1, snr: float = np.inf
     ) -> tuple[pd.DataFrame, pd.DataFrame]:
         angle, _ = disc.simulate(u, start, sampling_time)
-        noise = measurement_noise(angle[..., None], snr, n_repeats, noise_rng)
-        n_runs, n = n_repeats * len(u), u.shape[1]
-        table = {
-            "voltage": np.repeat(u, n_repeats, axis=0).ravel(),
-            "kappa": np.repeat(angle, n_repeats, axis=0).ravel(),
-            "experiment": np.repeat(np.arange(n_runs), n),
-            "time": np.tile(np.arange(n) * sampling_time, n_runs),
-        }
-        y = (angle[:, None] + noise[..., 0]).ravel()
-        return pd.DataFrame(table), pd.DataFrame({"angle": y})
+        X, y, dt = {"voltage": u, "kappa": angle}, angle[..., None], sampling_time
+        return experiment_tables(X, y, ["angle"], dt, snr, n_repeats, noise_rng)
 
     def about_points(rng: Generator) -> Array:
         moved = [bits(n_samples, rng)[0] for _ in range(n_points)]
