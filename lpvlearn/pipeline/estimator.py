@@ -597,23 +597,11 @@ list, default=None
         watch: Stopwatch,
     ) -> None:
         """Steps 4 and 5, and refinement on experiments that are `moving`."""
-        restructurer = self.restructurer
         with watch.step("restructuring", bar=True):  # step 4
-            limit = None if self.max_time is None else float(self.max_time)
-            known = local, points, runner, self.sampling_time_
             form = self._interpolator(len(points))
-            if restructurer is None:
-                ways = without_structure(*known, form, every=bool(moving))
-            else:
-                restructure = restructure_points
-                if self._hold_is_chosen_last:
-                    certain = self.discretization == "foh"
-                    restructure = partial(restructured_by_hold, certain=certain)
-                found = with_foreseen(restructure(restructurer, *known, limit))
-                ways = mirror_images(found) if moving else [found]
-            # experiments that move tell what no point does
+            ways = self._structured(local, points, form, runner, bool(moving))
             found = ways[0]
-            if moving:
+            if moving:  # which tells what no point does
                 found = best_along(ways, form, moving, self.sampling_time_)
             self.restructurers_ = found.restructurers
 
@@ -680,6 +668,29 @@ list, default=None
                 self.hinf_parameters_.iloc[row] = getattr(
                     fitted, "hinf_params_", fitted.params_
                 )
+
+    def _structured(
+        self,
+        local: list[LocalModel],
+        points: OperatingPoints,
+        form: Any,
+        runner: PointRunner,
+        every: bool,
+    ) -> list[StructuredModels]:
+        """The models of all points in one structure, or one basis: the best first.
+
+        And `every` one that only experiments which move tell from it.
+        """
+        known = local, points, runner, self.sampling_time_
+        if self.restructurer is None:
+            return without_structure(*known, form, every=every)
+        restructure = restructure_points
+        if self._hold_is_chosen_last:
+            certain = self.discretization == "foh"
+            restructure = partial(restructured_by_hold, certain=certain)
+        limit = None if self.max_time is None else float(self.max_time)
+        found = with_foreseen(restructure(self.restructurer, *known, limit))
+        return mirror_images(found) if every else [found]
 
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""

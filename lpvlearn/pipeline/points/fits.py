@@ -39,7 +39,7 @@ class Measured(NamedTuple):
             part = [e for e in group if len(e.rows) == length]
             n = max(1, _AT_ONCE // length)
             batches += [part[k : k + n] for k in range(0, len(part), n)]
-        return cls(batches, *_sizes([e.measured for e in group]))
+        return cls(batches, *_size_and_spread([e.measured for e in group]))
 
     def stacked(self) -> Iterator[tuple[Array, Array]]:
         """Of each batch inputs (length, n_inputs, n_runs), one run if all are alike.
@@ -55,7 +55,7 @@ class Measured(NamedTuple):
             yield np.stack(inputs, axis=-1), y
 
 
-def _sizes(outputs: Sequence[Array]) -> tuple[Array, Array]:
+def _size_and_spread(outputs: Sequence[Array]) -> tuple[Array, Array]:
     """`size` and `spread` of `Measured`, without a copy of all outputs."""
     n = np.sum([np.count_nonzero(~np.isnan(y), axis=0) for y in outputs], axis=0)
     known = np.maximum(n, 1)

@@ -313,7 +313,7 @@ def _in_one_basis(
     alone would not do where singular values are nearly equal, whose states may be
     turned.
     """
-    u, y = _sizes(experiments)
+    u, y = _rounded_sizes(experiments)
     models = _of_lowest_order(models)  # where none grew
     models = balanced_models([scaled(model, u, y) for model in models])
     first, *others = _of_lowest_order(models)  # nor lost what is rounding
@@ -331,11 +331,11 @@ def balanced_by_motion(
     """
     if not model.is_stable:
         return model
-    u, y = _sizes(experiments)
+    u, y = _rounded_sizes(experiments)
     return scaled(scaled(model, u, y).balance(order), 1.0 / u, 1.0 / y)
 
 
-def _sizes(experiments: Sequence[Experiment]) -> tuple[Array, Array]:
+def _rounded_sizes(experiments: Sequence[Experiment]) -> tuple[Array, Array]:
     """How far inputs and outputs move, about.
 
     Powers of two: no rounding, and the same wherever in memory the samples are.

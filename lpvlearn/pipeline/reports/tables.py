@@ -81,7 +81,7 @@ def tables(
     index = pd.Index(labels, name="operating_point", tupleize_cols=False)
     names = pd.Index(found.structure.parameter_names)
     interpolated = lpv.parameters(points.kappa)
-    unit = _sizes(theta)
+    unit = _root_mean_squares(theta)
     deviations = pd.DataFrame(spread, index, list(names))
 
     missed = False
@@ -349,7 +349,7 @@ def _interpolation(found: Tables, lpv: LPVStateSpace, kappa: Array) -> list[str]
     distance = 100 * report["interpolation_error"]
     form = getattr(lpv.interpolator, "form_", "")
     theta = found.parameters.to_numpy()
-    size = _sizes(theta)
+    size = _root_mean_squares(theta)
     fit = parameter_fit(theta / size, lpv.parameters(kappa) / size)
     lines = [
         f"Interpolation: {lpv.interpolator}{form and f' ({form})'}, "
@@ -370,7 +370,7 @@ def _interpolation(found: Tables, lpv: LPVStateSpace, kappa: Array) -> list[str]
     return lines
 
 
-def _sizes(theta: Array) -> Array:
+def _root_mean_squares(theta: Array) -> Array:
     """Root mean square of every parameter: together they count alike in any unit."""
     size = np.sqrt(np.mean(theta**2, axis=0))
     return np.where(size > 0.0, size, 1.0)

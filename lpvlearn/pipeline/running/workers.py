@@ -53,7 +53,7 @@ def check_jobs(n_jobs: Any) -> int | None:
 def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
 
-    No more than there are tasks, or processors.
+    No more than the larger of these numbers, that of tasks or that of processors.
 
     All at once where the backend of joblib cannot send them one by one, as Ray's.
     These are at work from now on. Raises a RuntimeError where one of them is killed
