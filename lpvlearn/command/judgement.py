@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from .. import LocalLPVPipeline, readable_report
-from ..pipeline.estimator import Stopwatch
+from ..pipeline.running.stopwatch import Stopwatch
 from .ending import in_options
 
 _LINE = 88  # characters

@@ -26,10 +26,10 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
-from ..pipeline.estimator import Stopwatch
 from ..pipeline.one_basis.black_boxes import balanced_entries
 from ..pipeline.points.local_models import experiments_of, unheard_model
 from ..pipeline.running.runner import PointRunner
+from ..pipeline.running.stopwatch import Stopwatch
 from ..pipeline.running.workers import give_way, started
 from .tables import (
     ParameterSet,

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Timer
-from time import perf_counter
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
@@ -101,6 +97,7 @@ from .reports.html_report import html_report
 from .reports.tables import Summary, Tables, summarise, tables
 from .running.memory import checked_memory
 from .running.runner import PointRunner
+from .running.stopwatch import Stopwatch
 from .running.workers import check_jobs
 from .scheduled import ScheduledEstimator
 from .steps import STEPS, WITHOUT, check_step
@@ -112,38 +109,6 @@ _DEFAULTS = {
     "restructurer": GrayBoxRestructurer,
     "interpolator": AutoLPV,
 }
-
-_PATIENCE = 2.0  # seconds after which one asks oneself what is going on
-
-
-@dataclass
-class Stopwatch:
-    """Wall-clock seconds of each step, in the order of the steps.
-
-    With `verbose`, a step without a bar of its own is told once it is long.
-    """
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    verbose: int = 0
-
-    @contextmanager
-    def step(self, name: str, *, bar: bool = False) -> Iterator[None]:
-        """Add the time that the block takes to the step."""
-        told = Timer(_PATIENCE, print, [f"{name} ..."], {"file": sys.stderr})
-        told.daemon = True
-        if self.verbose and not bar:
-            told.start()
-        start = perf_counter()
-        try:
-            yield
-        finally:
-            told.cancel()
-        self.seconds[name] = self.seconds.get(name, 0.0) + perf_counter() - start
-
-    def table(self) -> pd.DataFrame:
-        """Columns step and seconds, with the total."""
-        rows = [*self.seconds.items(), ("total", sum(self.seconds.values()))]
-        return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
 class LocalLPVPipeline(ScheduledEstimator):

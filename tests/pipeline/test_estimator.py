@@ -1,7 +1,6 @@
 """LocalLPVPipeline: from local experiments to an LPV model."""
 
 import pickle
-import time
 import warnings
 
 import numpy as np
@@ -25,7 +24,6 @@ from lpvlearn import (
 )
 from lpvlearn.datasets import make_unbalanced_disc
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
-from lpvlearn.pipeline.estimator import Stopwatch
 from lpvlearn.subspace.streams import stream
 
 from ..conftest import (
@@ -605,17 +603,6 @@ def test_motion_about_a_single_point_is_no_sweep():
 # -- time ------------------------------------------------------------------------------
 
 
-def test_a_stopwatch_adds_up_the_times_of_the_steps():
-    watch = Stopwatch({"a": 1.0})
-    for name in ("b", "a", "b"):
-        with watch.step(name):
-            pass
-    table = watch.table()
-    assert table["step"].tolist() == ["a", "b", "total"]
-    assert watch.seconds["a"] > 1.0 and watch.seconds["b"] > 0.0
-    assert table["seconds"].tolist()[-1] == sum(watch.seconds.values())
-
-
 @pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
 def test_a_prediction_that_diverges_names_the_experiment(spring):
     X, y, _, _ = spring
@@ -855,19 +842,6 @@ def test_a_passed_through_model_keeps_its_delay():
     for model in pipeline.structured_models_:
         np.testing.assert_allclose(model.input_delay, [0.04])
     assert pipeline.score(X, y) > 0.99
-
-
-@pytest.mark.parametrize(
-    ("verbose", "bar", "told"),
-    [(1, False, "figures ...\n"), (1, True, ""), (0, False, "")],
-)
-def test_steps_that_last_are_told_where_wanted(capsys, monkeypatch, verbose, bar, told):
-    monkeypatch.setattr("lpvlearn.pipeline.estimator._PATIENCE", 0.0)
-    watch = Stopwatch(verbose=verbose)
-    with watch.step("figures", bar=bar):
-        time.sleep(0.1)
-    assert capsys.readouterr() == ("", told)
-    assert watch.seconds["figures"] >= 0.1
 
 
 @pytest.mark.slow

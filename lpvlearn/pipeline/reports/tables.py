@@ -17,9 +17,11 @@ from ...lpv.spline import SplineLPV
 from ...lpv.weighting import noise_explains
 from ...metrics.reports import LABEL, as_shown, readable_report
 from ...metrics.scores import parameter_fit
+from ...models.statespace import StateSpace
 from ...restructuring.estimator import GrayBoxRestructurer
 from ...validation import number_shown
 from ..one_basis.structured_models import StructuredModels
+from ..points.common_delay import delay_in_samples
 from ..points.fits import Measured, fit_of
 from ..points.left_out import listed_errors
 from ..points.local_models import LocalModel
@@ -84,92 +86,22 @@ def tables(
     unit = _root_mean_squares(theta)
     deviations = pd.DataFrame(spread, index, list(names))
 
-    missed = False
-    delayed = any(model.lti.input_delay.any() for model in found.local)
     rows = []
-    for k, (group, model, gray_box) in enumerate(
-        zip(points.experiments, found.local, found.models, strict=True)
-    ):
-        known = Measured.of(group), sampling_time, model.n_trend, lpv.hold
-        row: dict[str, Any] = {
-            "n_experiments": len({e.label for e in group}),
-            "n_samples": sum(len(e.rows) for e in group),
-            "order": model.order,
-            "horizon": model.horizon,
-            "local_BFT": fit_of(model.lti, *known),
-        }
-        if lpv.offsets is None and not missed:
-            missed = _misses_constants(model, group, sampling_time, lpv.hold)
-        if found.restructurers:
-            structured = fit_of(gray_box, *known)
-            row["structured_BFT"] = structured
-            row |= _restructuring(found.restructurers[k])
-        frozen = lpv.at(points.kappa[k])
-        row["lpv_BFT"] = np.nan
-        if not frozen.poles().real.max(initial=0.0) > 0.0:
-            row["lpv_BFT"] = fit_of(frozen, *known)
-        if delayed:
-            samples = np.round(model.lti.input_delay / sampling_time).astype(int)
-            inputs = group[0].input_names
-            row |= {f"delay_{u}": d for u, d in zip(inputs, samples, strict=True)}
-        if lpv.offsets is not None:
-            place = points.kappa[[k]]
-            for prefix, signals, levels in (
-                ("u0_", lpv.input_names, lpv.input_offset(place)[0]),
-                ("y0_", lpv.output_names, lpv.output_offset(place)[0]),
-            ):
-                row |= {
-                    f"{prefix}{n}": v
-                    for n, v in zip(signals or (), levels, strict=True)
-                }
+    for k, own in enumerate(theta):
+        row = _of_models(k, found, lpv, sampling_time)
         met = found.structure.model(interpolated[k])
-        distance = (gray_box.with_input_delay(0) - met).hinf_norm()
-        size = gray_box.hinf_norm()
-        # infinite with integrators, whose gains need not agree
-        finite = 0 < size < np.inf
-        row["interpolation_error"] = distance / size if finite else np.nan
-        row["interpolation_FIT"] = parameter_fit(
-            theta[k] / unit, interpolated[k] / unit
-        )
+        row["interpolation_error"] = _interpolation_error(found.models[k], met)
+        row["interpolation_FIT"] = parameter_fit(own / unit, interpolated[k] / unit)
         row["growth_rate"] = growth[k]
         if found.restructurers:
-            row |= dict(zip("param_" + names, theta[k], strict=True))
+            row |= dict(zip("param_" + names, own, strict=True))
             if not np.isnan(spread).all():
                 row |= dict(zip("std_" + names, spread[k], strict=True))
         rows.append(row)
-
-    if missed and any(model.integrating for model in found.local):
-        warn(
-            "inputs or outputs stand away from zero, and models of `integrating` have "
-            "no offsets: what a constant input or rate adds up to is missed. Subtract "
-            "from the inputs where the system rests, or use the rates as outputs."
-        )
-    elif missed:
-        warn(
-            "inputs or outputs stand away from zero, and the LPV model has no offsets: "
-            "it misses what a constant of every experiment would explain. Have it "
-            "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
-            "subtract from X and y where the system rests."
-        )
-    errors = [(row["interpolation_error"], k) for k, row in enumerate(rows)]
-    far = sorted(((e, k) for e, k in errors if e > _MISSED), reverse=True)
-    form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
-    if far and form is not None and not noise_explains(form):
-        missed_at = listed_errors(far, points.kappa)
-        if isinstance(form, SplineLPV):  # which met all of them
-            warn(
-                f"records that move have taken the LPV model from operating point(s) "
-                f"{missed_at}, in percent of the H-infinity norm of the local models. "
-                "Check what sets these records apart from those of the points: another "
-                "load, units, offsets."
-            )
-        else:
-            warn(
-                "the LPV model misses the local models at operating point(s) "
-                f"{missed_at}, in percent of their H-infinity norm: its parameters do "
-                "not follow so simple a form. Use interpolator=SplineLPV(), which "
-                "meets all points."
-            )
+    by_point = pd.DataFrame(rows, index=index)
+    if lpv.offsets is None:
+        _tell_of_missed_constants(found, lpv.hold, sampling_time)
+    _tell_of_missed_points(by_point["interpolation_error"], lpv, points.kappa)
     by_parameter = {
         "lowest": theta.min(axis=0),
         "highest": theta.max(axis=0),
@@ -183,9 +115,97 @@ def tables(
     return Tables(
         pd.DataFrame(theta, index, list(names)),
         deviations,
-        pd.DataFrame(rows, index=index),
+        by_point,
         pd.DataFrame(by_parameter, index=names.rename("parameter")),
     )
+
+
+def _of_models(
+    k: int, found: StructuredModels, lpv: LPVStateSpace, sampling_time: float
+) -> dict[str, Any]:
+    """Experiments, local, structured and LPV model of an operating point."""
+    group, model = found.points.experiments[k], found.local[k]
+    known = Measured.of(group), sampling_time, model.n_trend, lpv.hold
+    row: dict[str, Any] = {
+        "n_experiments": len({e.label for e in group}),
+        "n_samples": sum(len(e.rows) for e in group),
+        "order": model.order,
+        "horizon": model.horizon,
+        "local_BFT": fit_of(model.lti, *known),
+    }
+    if found.restructurers:
+        row["structured_BFT"] = fit_of(found.models[k], *known)
+        row |= _restructuring(found.restructurers[k])
+    place = found.points.kappa[[k]]
+    frozen = lpv.at(place[0])
+    row["lpv_BFT"] = np.nan
+    if not frozen.poles().real.max(initial=0.0) > 0.0:
+        row["lpv_BFT"] = fit_of(frozen, *known)
+    if any(one.lti.input_delay.any() for one in found.local):
+        samples = delay_in_samples(model, sampling_time)
+        inputs = group[0].input_names
+        row |= {f"delay_{u}": d for u, d in zip(inputs, samples, strict=True)}
+    if lpv.offsets is not None:
+        for prefix, signals, levels in (
+            ("u0_", lpv.input_names, lpv.input_offset(place)[0]),
+            ("y0_", lpv.output_names, lpv.output_offset(place)[0]),
+        ):
+            named = zip(signals or (), levels, strict=True)
+            row |= {f"{prefix}{name}": level for name, level in named}
+    return row
+
+
+def _interpolation_error(gray_box: StateSpace, met: StateSpace) -> float:
+    """Distance to the interpolated model, relative to the norm of the point's own."""
+    size = gray_box.hinf_norm()
+    if not 0 < size < np.inf:  # with integrators, whose gains need not agree
+        return np.nan
+    return (gray_box.with_input_delay(0) - met).hinf_norm() / size
+
+
+def _tell_of_missed_constants(
+    found: StructuredModels, hold: str, sampling_time: float
+) -> None:
+    """Tell what a model without offsets lacks, if it lacks some."""
+    each = zip(found.local, found.points.experiments, strict=True)
+    if not any(_misses_constants(*one, sampling_time, hold) for one in each):
+        return
+    if any(model.integrating for model in found.local):
+        warn(
+            "inputs or outputs stand away from zero, and models of `integrating` have "
+            "no offsets: what a constant input or rate adds up to is missed. Subtract "
+            "from the inputs where the system rests, or use the rates as outputs."
+        )
+    else:
+        warn(
+            "inputs or outputs stand away from zero, and the LPV model has no offsets: "
+            "it misses what a constant of every experiment would explain. Have it "
+            "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
+            "subtract from X and y where the system rests."
+        )
+
+
+def _tell_of_missed_points(errors: pd.Series, lpv: LPVStateSpace, kappa: Array) -> None:
+    """Tell of points that are missed by a form, where noise does not explain it."""
+    far = [(e, k) for k, e in enumerate(errors) if e > _MISSED]
+    form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
+    if not far or form is None or noise_explains(form):
+        return
+    missed_at = listed_errors(sorted(far, reverse=True), kappa)
+    if isinstance(form, SplineLPV):  # which met all of them
+        warn(
+            f"records that move have taken the LPV model from operating point(s) "
+            f"{missed_at}, in percent of the H-infinity norm of the local models. "
+            "Check what sets these records apart from those of the points: another "
+            "load, units, offsets."
+        )
+    else:
+        warn(
+            "the LPV model misses the local models at operating point(s) "
+            f"{missed_at}, in percent of their H-infinity norm: its parameters do "
+            "not follow so simple a form. Use interpolator=SplineLPV(), which "
+            "meets all points."
+        )
 
 
 def _misses_constants(
@@ -199,9 +219,10 @@ def _misses_constants(
     best, without = (
         fit_of(model.lti, measured, sampling_time, n, hold) for n in (constants, 0)
     )
-    if best - without > _WORTH or not without < _POOR:
-        return best - without > _WORTH
-    return any((abs(mean) > _FAR * scale).any() for mean, scale in motions(group))
+    return best - without > _WORTH or (
+        without < _POOR
+        and any((abs(mean) > _FAR * scale).any() for mean, scale in motions(group))
+    )
 
 
 def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
