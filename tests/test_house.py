@@ -1,6 +1,7 @@
 """The house stands: no import upward, scikit-learn only where estimators live."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -176,3 +177,18 @@ def test_packages_hand_on_what_they_list():
             if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"
         ]
         assert handed == set(listed[0] if listed else ()), package.name
+
+
+BENCHMARKS = sorted((Path(__file__).parent / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda p: p.name)
+def test_benchmarks_import_what_is_there(path):
+    """They need peers that no test has, and are run by hand."""
+    for node in imports_of(path):
+        module = getattr(node, "module", None) or ""
+        if module.split(".")[0] == "lpvlearn":
+            room = importlib.import_module(module)
+            for name in (alias.name for alias in node.names):
+                if not hasattr(room, name):
+                    importlib.import_module(f"{module}.{name}")

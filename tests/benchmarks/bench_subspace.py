@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from lpvlearn.subspace.orders.realization import identification
+from lpvlearn.subspace.orders import identification
 from lpvlearn.subspace.orders.selection import select
 from lpvlearn.subspace.samples.hankel import _hankel_matrix, data_factors
 from lpvlearn.subspace.samples.records import scale_records
