@@ -14,6 +14,7 @@ from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
 from .drawing import (
     axes_grid,
+    band,
     by_name,
     drawable,
     figure_legend,
@@ -334,9 +335,7 @@ class BodeDisplay:
                     self.omega, middle, label=name, **style
                 )
                 if name in spread:
-                    axes[i, j].fill_between(
-                        self.omega, low, high, color=style["color"], alpha=0.2, lw=0
-                    )
+                    band(axes[i, j], self.omega, low, high, style["color"])
         return lines
 
     def _dress(self, axes: Any) -> None:

@@ -120,6 +120,11 @@ def tidy(ax: Any) -> None:
         axis.label.set_fontsize(LABEL_SIZE)
 
 
+def band(ax: Any, x: Any, low: Any, high: Any, colour: Any, alpha: float = 0.2) -> None:
+    """What is not known of a curve, as a pale band about it."""
+    ax.fill_between(x, low, high, color=colour, alpha=alpha, lw=0)
+
+
 def legend_above(
     ax: Any, handles: Sequence[Any], *, n_columns: int = 3, title: str | None = None
 ) -> Any:

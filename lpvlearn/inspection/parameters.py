@@ -15,6 +15,7 @@ from ..data.tables import as_numbers
 from ..models.scheduling_range import domains
 from .drawing import (
     axes_grid,
+    band,
     by_name,
     colour_bar,
     colour_scale,
@@ -429,14 +430,7 @@ class ParameterDisplay:
                     )
                 if name in bands:
                     middle, width = curves[name][:, column], bands[name][:, column]
-                    one.fill_between(
-                        fine,
-                        middle - width,
-                        middle + width,
-                        color=style["color"],
-                        alpha=0.2,
-                        lw=0,
-                    )
+                    band(one, fine, middle - width, middle + width, style["color"])
                 if name in curves:
                     (curve,) = one.plot(
                         fine,

@@ -17,6 +17,7 @@ from ..metrics.scores import best_fit
 from .drawing import (
     ACCENT,
     axes_grid,
+    band,
     by_name,
     drawable,
     legend_above,
@@ -330,14 +331,8 @@ class SimulationDisplay:
                 if name in self.std:
                     width = n_std * self.std[name][:, i]
                     low, high = signal[:, i] - width, signal[:, i] + width
-                    one.fill_between(
-                        self.time[shown],
-                        low[shown],
-                        high[shown],
-                        color=line.get_color(),
-                        alpha=0.35,
-                        lw=0,
-                    )
+                    ends, colour = (low[shown], high[shown]), line.get_color()
+                    band(one, self.time[shown], *ends, colour, alpha=0.35)
             tidy(one)
             one.set_ylabel(with_unit(self.output_names[i], self.units[i]))
             one.set_xlim(self.time[shown][0], self.time[shown][-1])

@@ -15,13 +15,13 @@ from ..models.statespace import StateSpace
 from .drawing import (
     ACCENT,
     INK,
-    axes_grid,
     colour_bar,
     colour_scale,
     drawable,
     labels_of,
     legend_above,
     plain_ticks,
+    single_axes,
     tidy,
 )
 from .fitted import fitted_pipeline, scheduling_labels
@@ -166,8 +166,7 @@ class UncertaintyDisplay:
         -------
         UncertaintyDisplay
         """
-        self.figure_, axes = axes_grid(ax, 1, 1, height=3.6)
-        self.axes_ = axes.ravel()
+        self.figure_, self.axes_ = single_axes(ax, height=3.6)
         self.ax_ = one = self.axes_[0]
         self.curve_: Any = None
         tidy(one)
