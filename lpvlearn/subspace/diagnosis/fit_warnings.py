@@ -8,9 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.faulty_signals import (
-    far_out,
-)
+from ...data.faulty_signals import far_out
 from ...data.preparation import independent_inputs
 from ...exceptions import RankWarning
 from ..evidence.constancy import change_over

@@ -32,6 +32,7 @@ from ...systems.modes import (
 from ...systems.simulation import lti_response, trend_signals
 from ..samples.records import Record
 from ..simulation_error.noise import autoregression, spectral_density
+from ..simulation_error.refinement import UNDETERMINED
 from ..simulation_error.signals import signal_factor
 from ..simulation_error.simulation_fit import (
     Realization,
@@ -41,7 +42,7 @@ from ..simulation_error.simulation_fit import (
     simulation_errors,
     with_initial_states,
 )
-from .offsets import Offsets
+from .offsets import ROUNDING, Offsets
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -72,8 +73,6 @@ _N_TESTED = 20  # experiments that the tests look at; more of them tell the same
 _EXPLAINED = 1e-6
 _AT_ONE = 1e-9  # distance from one of a pole beside which there is no constant
 
-_RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
-_ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _BEYOND = 100.0  # times the largest output: a constant that is none
 _FEW_MOVES = 10  # of inputs, whose answers may be straight lines
 # Standard deviations between the mean of a channel and zero, from which constants are
@@ -225,7 +224,7 @@ def motions_left(evidence: Evidence) -> Array:
 
 def leaves_rounding(evidence: Evidence) -> bool:
     """Whether what a model leaves tells nothing."""
-    return motion_left(evidence) < _ROUNDING**2
+    return motion_left(evidence) < ROUNDING**2
 
 
 def _levels(parts: Sequence[Array]) -> tuple[Array, Array]:
@@ -452,7 +451,7 @@ def _chance(
     size = np.sqrt(np.repeat([len(v) for v in errors], ny))
     if equal:
         jacobian = np.column_stack([jacobian, constants])
-    explained = linalg.orth(jacobian / column_scale(jacobian), _RCOND)
+    explained = linalg.orth(jacobian / column_scale(jacobian), UNDETERMINED)
     own = (own - explained @ (explained.T @ own)) / size
     values, vectors = np.linalg.eigh(own.T @ own)
     own = own @ vectors[:, values > _EXPLAINED]
@@ -461,7 +460,7 @@ def _chance(
     # Rows: experiments times outputs times signals.
     effect = own.reshape(len(parts), ny, -1, own.shape[1])
     score, stacked = own.T @ error, np.vstack(errors)
-    rounding = _ROUNDING**2 * np.eye(ny)
+    rounding = ROUNDING**2 * np.eye(ny)
     white = stacked.T @ stacked / n_samples + rounding
     n_error = n_samples - jacobian.shape[1] - own.shape[1]
     chance = _tail(score, effect, white, n_error)

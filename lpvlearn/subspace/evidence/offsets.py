@@ -23,6 +23,7 @@ from ...systems.least_squares import column_scale
 from ...systems.modes import n_changes
 from ...systems.simulation import free_responses, trend_signals
 from ..samples.records import Centres
+from ..simulation_error.refinement import UNDETERMINED
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -30,8 +31,7 @@ Array = NDArray[np.float64]
 # Trends of every output and experiment; "auto" begins without.
 N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
 
-_RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
-_ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
+ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _SETTLED = 10.0  # time constants per experiment of a mode that forgets its beginning
 _RELUCTANTLY = 1e-4  # taken: initial states where offsets do as well
 _UNSEEN = 0.1  # share of the errors that inputs need not explain of a line
@@ -129,7 +129,7 @@ def of_rates(rates: Offsets, gain: Array, flags: NDArray[np.bool_]) -> Offsets:
         return rates
     inputs = -linalg.lstsq(gain[flags], c[:, flags].T)[0].T
     left = c + inputs @ gain.T
-    left[np.abs(left) <= _ROUNDING * np.abs(c)] = 0.0
+    left[np.abs(left) <= ROUNDING * np.abs(c)] = 0.0
     outputs, drifts = np.where(flags, 0.0, left), np.where(flags, left, 0.0)
     return Offsets(inputs, outputs, drifts, none, rates.n_samples, rates.differ)
 
@@ -160,7 +160,7 @@ def _as_they_begin(
         columns = (columns / scale[:, None]).reshape(n * ny, -1)
         size = column_scale(columns)
         size[m + ny :] /= _RELUCTANTLY
-        x = linalg.lstsq(columns / size, target.ravel(), _RCOND)[0]
+        x = linalg.lstsq(columns / size, target.ravel(), UNDETERMINED)[0]
         left = target.ravel() - columns / size @ x
         with np.errstate(over="ignore", invalid="ignore"):  # of a model that grows
             most = _UNSEEN * noise + _NEARLY * target.std(axis=0).max()
