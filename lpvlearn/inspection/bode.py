@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.tables import as_numbers
-from ..metrics.scorers import unwrapped
+from ..metrics.table_simulation import unwrapped
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
 from .drawing import (

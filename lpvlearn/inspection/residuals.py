@@ -12,7 +12,7 @@ from scipy.stats import norm
 from ..data.alignment import align_outputs
 from ..data.preparation import read_runs
 from ..data.tables import Table, as_numbers, read_outputs
-from ..metrics.scorers import unwrap
+from ..metrics.table_simulation import unwrap
 from ..subspace import SubspaceLTI
 from ..subspace.evidence.residuals import (
     Residuals,

@@ -12,8 +12,9 @@ from ..data.alignment import align_outputs, beside
 from ..data.experiments import ROLES, fitted_roles
 from ..data.tables import Table, as_numbers, read_outputs
 from ..data.timestamps import time_in_seconds
-from ..metrics.scorers import check_options, simulate, unwrap
+from ..metrics.scorers import check_options
 from ..metrics.scores import best_fit
+from ..metrics.table_simulation import simulate, unwrap
 from .drawing import (
     ACCENT,
     axes_grid,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..data.tables import as_numbers
-from ..metrics.scorers import unwrapped
+from ..metrics.table_simulation import unwrapped
 from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, drawable, single_axes, tidy, whole
 
 _MOST_SHOWN = 10**6  # no picture shows more

@@ -14,17 +14,17 @@ from ..data.operating_points import mean_values
 from ..data.tables import Table
 from ..models.statespace import StateSpace
 from ..validation import number_shown, one_of, squarable
-from .scorers import (
-    InitialState,
-    check_options,
+from .scorers import InitialState, check_options
+from .scores import accounted_variance, best_fit, r2_ratio
+from .table_simulation import (
+    ScheduledModel,
+    TableSimulator,
     drop_start,
     owner_of_experiments,
     simulate,
     split,
     unwrap,
 )
-from .scores import accounted_variance, best_fit, r2_ratio
-from .table_simulation import ScheduledModel, TableSimulator
 
 
 def fit_report(

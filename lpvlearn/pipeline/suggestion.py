@@ -13,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..data.operating_points import neighbours
 from ..lpv.left_out import interpolated_without
 from ..lpv.weighting import covariance_factor
-from ..metrics.scorers import unwrapped
+from ..metrics.table_simulation import unwrapped
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..systems.least_squares import row_and_column_scales
