@@ -730,7 +730,7 @@ class SubspaceLTI(ScoredFromRest):
         known = experiments, flags, step, *names
         none = Direct(np.zeros((len(flags), experiments[0].inputs.shape[1])))
         found = none
-        if self.input_delay == 0:
+        if isinstance(self.input_delay, str) or not np.any(self.input_delay):
             found = direct_of(experiments, flags, self.feedthrough) or none
         if found.sure:
             self._integrate(*known, found)
@@ -742,8 +742,10 @@ class SubspaceLTI(ScoredFromRest):
             other._integrate(*known, found)
 
         def error(model: Self) -> float:
-            left = np.asarray(y) - model.predict_with_initial_state(X, y)
-            return float(np.nansum(np.square(left, dtype=float)))
+            found = np.asarray(model.predict_with_initial_state(X, y))
+            found = found.reshape(len(found), -1)
+            left = [e.measured - found[e.rows] for e in experiments]
+            return float(np.sum(np.square(np.vstack(left))))
 
         acts = error(other) < ACTS * error(self)
         if acts:
@@ -770,6 +772,8 @@ class SubspaceLTI(ScoredFromRest):
         if direct is True and self.method == "auto" and not flags.all():
             direct = not without_direct(experiments, moved)
         options = options_of_rates(table, flags, direct, step)
+        if known.D.any():  # what acts at once is not late
+            options["input_delay"] = 0
         rate_model = clone(self).set_params(**options)
         self.rates_ = inner = rate_model._fit_table(table, rates, names=labels)
         best = inner

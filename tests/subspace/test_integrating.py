@@ -321,6 +321,10 @@ def test_a_resistance_that_may_be_a_controller_is_told():
     with pytest.warns(UserWarning, match="The former was taken.*feedthrough"):
         model = SubspaceLTI(**options).fit(u, y)
     np.testing.assert_allclose(model.lti_.D, 0.0136, rtol=5e-3)
+    table = pd.DataFrame(y, columns=["v"]).astype("Float64")  # as of Arrow or a cloud
+    with pytest.warns(UserWarning, match="The former was taken.*feedthrough"):
+        same = SubspaceLTI(**options).fit(pd.DataFrame(u, columns=["i"]), table)
+    np.testing.assert_array_equal(same.lti_.D, model.lti_.D)
     said = SubspaceLTI(**options, feedthrough=[[True]]).fit(u, y)
     np.testing.assert_allclose(said.lti_.D, 0.0136, rtol=5e-3)
 
