@@ -18,9 +18,9 @@ from .drawing import (
     by_name,
     drawable,
     figure_legend,
+    given_names,
     line_style,
     named,
-    names_of,
     tidy,
     units_of,
     whole,
@@ -117,8 +117,8 @@ class BodeDisplay:
                     "inputs)."
                 )
         self.std = self._check_std(std)
-        self.output_names = names_of("output_names", output_names, first[1], "y")
-        self.input_names = names_of("input_names", input_names, first[2], "u")
+        self.output_names = given_names("output_names", output_names, first[1], "y")
+        self.input_names = given_names("input_names", input_names, first[2], "u")
         self.units = by_name("units", units)
 
     def _check_std(self, std: Mapping[str, ArrayLike] | None) -> dict[str, Array]:

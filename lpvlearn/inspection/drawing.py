@@ -221,14 +221,14 @@ def units_of(
         return [units] * len(names)
     if isinstance(units, Mapping):
         return [units.get(str(name)) for name in names]
-    return list(names_of("units", units, len(names), ""))
+    return list(given_names("units", units, len(names), ""))
 
 
 def labels_of(label: str | Sequence[str], n: int) -> list[str]:
     """Labels of n scheduling variables; one for several is numbered."""
     if isinstance(label, str):
         return [label] if n == 1 else [f"{label}{k + 1}" for k in range(n)]
-    return names_of("scheduling_label", label, n, "κ")
+    return given_names("scheduling_label", label, n, "κ")
 
 
 def colour_scale(values: Any) -> dict[str, Any]:
@@ -272,7 +272,7 @@ def is_names(names: Any) -> bool:
     return listed and all(isinstance(name, Hashable) for name in names)
 
 
-def names_of(argument: str, names: Any, n: int, letter: str) -> list[str]:
+def given_names(argument: str, names: Any, n: int, letter: str) -> list[str]:
     """Given names, else the letter with numbers from 1."""
     if names is None:
         return [f"{letter}{k + 1}" for k in range(n)]

@@ -21,10 +21,10 @@ from .drawing import (
     colour_scale,
     drawable,
     figure_legend,
+    given_names,
     is_names,
     labels_of,
     named,
-    names_of,
     point_style,
     tidy,
     units_of,
@@ -492,7 +492,7 @@ def _names_and_choice(
         argument, table = next(iter(sets.items()))
         shape = as_numbers(f"parameters[{argument!r}]", table).shape
         n_params = shape[-1] if len(shape) == 2 else 0
-        return names_of("names", names, n_params, "p"), list(range(n_params))
+        return given_names("names", names, n_params, "p"), list(range(n_params))
     known = [str(column) for column in tables[0].columns]
     if names is not None and not is_names(names):
         raise ValueError(f"`names` must be a list of parameters. Got {names!r}.")

@@ -32,7 +32,7 @@ from .drawing import (
     axes_grid,
     drawable,
     figure_legend,
-    names_of,
+    given_names,
     tidy,
 )
 
@@ -116,8 +116,8 @@ class ResidualDisplay:
                 f"`inputs` must have as many samples as `errors`, {sizes}. Got "
                 f"{[len(part) for part in u]}."
             )
-        outputs = names_of("output_names", output_names, parts[0].shape[1], "y")
-        names = names_of("input_names", input_names, u[0].shape[1], "u")
+        outputs = given_names("output_names", output_names, parts[0].shape[1], "y")
+        names = given_names("input_names", input_names, u[0].shape[1], "u")
         self._examine(Residuals(parts, u, outputs, names), n_lags, confidence, what)
 
     def _examine(

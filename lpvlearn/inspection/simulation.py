@@ -21,9 +21,9 @@ from .drawing import (
     band,
     by_name,
     drawable,
+    given_names,
     legend_above,
     line_style,
-    names_of,
     tidy,
     units_of,
     whole,
@@ -139,7 +139,7 @@ class SimulationDisplay:
                     f"shape {own.shape}."
                 )
         given = names if output_names is None else output_names
-        self.output_names = names_of("output_names", given, n_outputs, "y")
+        self.output_names = given_names("output_names", given, n_outputs, "y")
         self.units = units_of(self.output_names, units)
         self.time_label = time_label
 
