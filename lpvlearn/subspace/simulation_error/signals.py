@@ -41,6 +41,23 @@ _SHORT = 256
 _LARGEST = 1e200  # squares of responses beyond it would overflow
 
 
+class Layout(NamedTuple):
+    """Where the signals of a kind stand among all of them."""
+
+    sections: slice  # impulse and inputs, of every state
+    inputs: slice
+    outputs: slice
+    second: slice  # of every state, where there are second responses
+    trends: slice
+
+    @classmethod
+    def of(cls, n: int, m: int, ny: int, *, second: bool = False) -> Layout:
+        """That of a model of n states with m inputs and ny outputs."""
+        a = n * (1 + m)
+        b, c, d = a + m, a + m + ny, a + m + ny + n * second
+        return cls(slice(a), slice(a, b), slice(b, c), slice(c, d), slice(d, None))
+
+
 class Sections(NamedTuple):
     """Block-diagonal form: ``A @ transform = transform @ block_diag(*blocks)``."""
 
@@ -121,21 +138,18 @@ def signal_pieces(
 ) -> Iterator[Array]:
     """Signals of consecutive stretches of a record, (n_signals, n_samples_i).
 
-    Rows: section signals, inputs, outputs, second responses block by block, trends.
-    Section signals: for each block and each of its signals, the answer to an impulse
-    that sets the state at time 0, then those to each input. Second responses come
-    where `driven` is given, ``[x0, B]`` of shape (order, 1 + n_inputs): what every
-    block answers to its own states, the last signal of it only, since
-    ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
+    Rows as in `Layout`: for each block and each of its signals, the answer to an
+    impulse that sets the state at time 0, then those to each input; inputs; outputs;
+    second responses where `driven` is given, ``[x0, B]`` of shape (order, 1 +
+    n_inputs): what every block answers to its own states, the last signal of it only,
+    since ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
     The memory is used again for the next piece.
     """
     (m, n_samples), ny, n_trend = record.u.shape, len(record.y), len(record.trend)
     order = sum(len(block) for block in blocks)
-    base = order * (1 + m)
     state_map = None if driven is None else state_coefficients(blocks, driven)
-    second = 0 if state_map is None else order
-    last = base + m + ny + second
-    memory = np.empty((last + n_trend, min(n_samples, _PIECE)))
+    at = Layout.of(order, m, ny, second=driven is not None)
+    memory = np.empty((at.trends.start + n_trend, min(n_samples, _PIECE)))
     first_bank = _SectionBank(blocks, [1 + m] * len(blocks))
     source = np.zeros((1 + m, memory.shape[1]))
     source[0, 0] = 1.0
@@ -151,16 +165,16 @@ def signal_pieces(
             source[0, 0] = 0.0
             source[1:, 0] = record.u[:, start - 1]
         source[1:, 1:n] = record.u[:, start : stop - 1]
-        first_bank.run(source[:, :n], X[:base].reshape(order, 1 + m, n))
-        X[base : base + m] = record.u[:, start:stop]
-        X[base + m : base + m + ny] = record.y[:, start:stop]
+        first_bank.run(source[:, :n], X[at.sections].reshape(order, 1 + m, n))
+        X[at.inputs] = record.u[:, start:stop]
+        X[at.outputs] = record.y[:, start:stop]
         if state_map is not None:
             late[:, 0] = last_state
-            late[:, 1:n] = state_map @ X[:base, :-1]
-            last_state = state_map @ X[:base, -1]
-            second_bank.run_last(late[:, :n], X[base + m + ny : last])
+            late[:, 1:n] = state_map @ X[at.sections, :-1]
+            last_state = state_map @ X[at.sections, -1]
+            second_bank.run_last(late[:, :n], X[at.second])
         if n_trend:
-            X[last:] = record.trend[:, start:stop]
+            X[at.trends] = record.trend[:, start:stop]
         yield X
 
 
@@ -222,29 +236,26 @@ def _short_factors(
     (m, _), ny, n_trend = records[0].u.shape, len(records[0].y), len(records[0].trend)
     order, n_records = sum(len(block) for block in blocks), len(records)
     lengths = [record.n_samples for record in records]
-    longest, base = max(lengths), order * (1 + m)
-    second = 0 if driven is None else order
-    X = np.zeros((base + m + ny + second + n_trend, n_records, longest))
-    after = X[base + m + ny + second :]
+    longest, at = max(lengths), Layout.of(order, m, ny, second=driven is not None)
+    X = np.zeros((at.trends.start + n_trend, n_records, longest))
     for i, (record, n) in enumerate(zip(records, lengths, strict=True)):
-        X[base : base + m, i, :n], X[base + m : base + m + ny, i, :n] = record[:2]
+        X[at.inputs, i, :n], X[at.outputs, i, :n] = record[:2]
         if n_trend:
-            after[:, i, :n] = record.trend
+            X[at.trends, i, :n] = record.trend
     source = np.zeros((1 + m, n_records, longest))
     source[0, :, 0] = 1.0
-    source[1:, :, 1:] = X[base : base + m, :, :-1]
+    source[1:, :, 1:] = X[at.inputs, :, :-1]
     width = (1 + m) * n_records
     with np.errstate(over="ignore", invalid="ignore"):
-        _SectionBank(blocks, [width] * len(blocks)).run(
-            source.reshape(width, longest), X[:base].reshape(order, width, longest)
-        )
+        sections = X[at.sections].reshape(order, width, longest)
+        bank = _SectionBank(blocks, [width] * len(blocks))
+        bank.run(source.reshape(width, longest), sections)
         if driven is not None:
             late = np.zeros((order, n_records, longest))
-            states = state_coefficients(blocks, driven) @ X[:base].swapaxes(0, 1)
+            states = state_coefficients(blocks, driven) @ X[at.sections].swapaxes(0, 1)
             late[:, :, 1:] = states.swapaxes(0, 1)[:, :, :-1]
             widths = [len(block) * n_records for block in blocks]
-            answers = X[base + m + ny : base + m + ny + second]
-            _SectionBank(blocks, widths).run_last(late, answers)
+            _SectionBank(blocks, widths).run_last(late, X[at.second])
         for i, n in enumerate(lengths):
             X[:, i, n:] = 0.0
         rows = X.transpose(1, 2, 0)
@@ -295,7 +306,7 @@ class SharedSignals:
     ) -> Array | None:
         """As `signal_factor`, which it asks for what does not fit into a piece."""
         (m, n_samples), (ny, order) = record.u.shape, (len(record.y), len(driven))
-        first = order * (1 + m) + m  # row of the outputs
+        outputs = Layout.of(order, m, ny).outputs
         if n_samples > _PIECE or len(record.trend):
             return signal_factor(blocks, record, driven)
         of = (*blocks, driven, record.u)
@@ -304,10 +315,10 @@ class SharedSignals:
                 (X,) = signal_pieces(blocks, record, driven)
                 self._of, self._known = of, (X, X @ X.T)
         X, gram = self._known[0], self._known[1].copy()
-        X[first : first + ny] = record.y
+        X[outputs] = record.y
         with np.errstate(over="ignore", invalid="ignore"):
-            gram[first : first + ny] = products = record.y @ X.T
-        gram[:, first : first + ny] = products.T
+            gram[outputs] = products = record.y @ X.T
+        gram[:, outputs] = products.T
         if not gram.diagonal().max() < _LARGEST:
             return None
         return factor_of_pieces(gram, [X]).T

@@ -33,6 +33,7 @@ from ...systems.simulation import (
 from ..samples.hankel import triangularize
 from ..samples.records import Record
 from .signals import (
+    Layout,
     Pairs,
     Places,
     SharedSignals,
@@ -370,8 +371,7 @@ def linear_regression(
     rows = R.reshape(-1, R.shape[-1])
     out = np.zeros((ny, len(rows), free.n_linear(n) + 1))
     _fill_linear(out, rows, Pairs.of(blocks), C, free)
-    base = n * (1 + m)
-    out[:, :, -1] = rows[:, base + m : base + m + ny].T
+    out[:, :, -1] = rows[:, Layout.of(n, m, ny).outputs].T
     return _by_experiment(out, R.shape[:-1])
 
 
@@ -395,7 +395,7 @@ def jacobian_regression(
     blocks, C, D = model.blocks, model.C, model.D
     assert blocks is not None
     (ny, n), m, shape = C.shape, D.shape[1], R.shape[:-1]
-    column, base = free.n_linear(n), n * (1 + m)
+    column, at = free.n_linear(n), Layout.of(n, m, ny, second=True)
     size_a = sum(block.size for block in blocks)
     R = R.reshape(-1, R.shape[-1])
     k, n_experiments = len(R), int(np.prod(shape[:-1]))
@@ -404,16 +404,16 @@ def jacobian_regression(
     out = np.zeros((ny, k, column + size_a + ny * n + 1))
     pairs = Pairs.of(blocks)
     _fill_linear(out, R, pairs, C, free)
-    second = R[:, base + m + ny :]
+    second = R[:, at.second]
     # Entry (p, q) of a block drives state p with state q.
     start, N = pairs
     for i in range(start):
         out[:, :, column + i] = C[:, [i]] * second[:, i]
     own = driven[:, start:].reshape(n_experiments, len(N), 2, 1 + m)
     own = own.transpose(1, 0, 3, 2)
-    answer = second[:, start : start + 2 * len(N)].reshape(k, len(N), 2)
+    answer = second[:, start:].reshape(k, len(N), 2)
     answer = answer.swapaxes(0, 1)
-    signals = R[:, :base].reshape(*each, n, 1 + m)
+    signals = R[:, at.sections].reshape(*each, n, 1 + m)
     late = signals[:, :, start + 1 :: 2].transpose(2, 0, 1, 3) @ own
     first = answer @ N.swapaxes(1, 2) + late.reshape(answer.shape)
     seen = C[:, start:].reshape(ny, -1, 2).swapaxes(0, 1)  # (n_pairs, n_outputs, 2)
@@ -423,11 +423,11 @@ def jacobian_regression(
     entries[:] = effect.transpose(1, 2, 0, 3, 4).reshape(entries.shape)
     column += size_a
     coefficients = state_coefficients(blocks, driven).swapaxes(1, 2)
-    states = (R[:, :base].reshape(*each, base) @ coefficients).reshape(k, n)
+    states = (signals.reshape(*each, n * (1 + m)) @ coefficients).reshape(k, n)
     for i in range(ny):
         out[i, :, column + i * n : column + (i + 1) * n] = states
-    fitted = states @ C.T + R[:, base : base + m] @ D.T
-    out[:, :, -1] = (R[:, base + m : base + m + ny] - fitted).T
+    fitted = states @ C.T + R[:, at.inputs] @ D.T
+    out[:, :, -1] = (R[:, at.outputs] - fitted).T
     return _by_experiment(out, shape)
 
 
@@ -465,8 +465,9 @@ def linearised(
 def _fill_linear(out: Array, R: Array, pairs: Pairs, C: Array, free: Freedom) -> None:
     """Fill in the effects of own unknowns, B and the free entries of D."""
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
-    own, n_states, base = free.n_own(n), free.n_states(n), n * (1 + m)
-    signals = R[:, :base].reshape(k, n, 1 + m).swapaxes(1, 2).reshape(k * (1 + m), n)
+    own, n_states, at = free.n_own(n), free.n_states(n), Layout.of(n, m, ny)
+    by_state = R[:, at.sections].reshape(k, n, 1 + m)
+    signals = by_state.swapaxes(1, 2).reshape(k * (1 + m), n)
     coefficients = _output_coefficients(pairs, C).reshape(n, ny * n)
     effect = (signals @ coefficients).reshape(k, 1 + m, ny, n).transpose(2, 0, 3, 1)
     out[:, :, :n_states] = effect[:, :, :n_states, 0]
@@ -477,7 +478,7 @@ def _fill_linear(out: Array, R: Array, pairs: Pairs, C: Array, free: Freedom) ->
     out[:, :, own : own + n * m] = effect[..., 1:].reshape(ny, k, n * m)
     where = zip(*free.direct.nonzero(), strict=True)
     for column, (i, j) in enumerate(where, start=own + n * m):
-        out[i, :, column] = R[:, base + j]
+        out[i, :, column] = R[:, at.inputs.start + j]
 
 
 def _output_coefficients(pairs: Pairs, C: Array) -> Array:
