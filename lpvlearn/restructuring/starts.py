@@ -220,8 +220,8 @@ def _rounds(
 ) -> tuple[list[LeastSquaresResult], bool]:
     """Rounds of candidates and fits, until two agree, and whether they do.
 
-    One fit that is exact needs no other. Starts of one round have
-    much in common, which may mislead all of them.
+    One fit that is exact needs no other. Starts of one round have much in common,
+    which may mislead all of them.
     """
     structure, n_fits = problem.structure, _N_FITS + len(given)
     linear = structure.order == 0 and structure.is_affine  # one optimum
