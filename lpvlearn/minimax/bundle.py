@@ -31,8 +31,7 @@ from .problem import (
 
 Array = NDArray[np.float64]
 
-# Some times as many as the peaks of an optimum; the rest only costs time.
-_MAX_CUTS = 60
+_MAX_CUTS = 60  # some times the peaks of an optimum; the rest only costs time
 _ROOM = 10  # cuts for which room is made at once
 _SERIOUS = 0.1  # a step is taken when it brings that part of the promised decrease
 _GOOD = 0.7  # the model was good: the next step may be longer
@@ -118,11 +117,9 @@ def proximal_bundle(
             tau *= _TIGHTER if still >= _UNEXPLAINED * promised else 1.0
             model = model.refined(cuts, d)
         converged = tau > _STIFFEST  # no step, however short, lowers the objective
-    constraints = problem.constraints(y)
-    slope, bend, valley = certificate(problem, y, peaks, constraints, negligible)
-    return MinimaxResult(
-        y, peaks, slope, bend, converged, n_iter, history, cause, valley
-    )
+    slope, bend, valley = certificate(problem, y, peaks, negligible)
+    found = y, peaks, slope, bend
+    return MinimaxResult(*found, converged, n_iter, history, cause, valley)
 
 
 @dataclass(frozen=True)

@@ -237,11 +237,7 @@ class Certificate(NamedTuple):
 
 
 def certificate(
-    problem: MinimaxProblem,
-    y: Array,
-    peaks: Peaks,
-    constraints: tuple[Array, Array],
-    negligible: float,
+    problem: MinimaxProblem, y: Array, peaks: Peaks, negligible: float
 ) -> Certificate:
     """Stationarity and second-order measure at a point."""
     f = peaks.top
@@ -249,7 +245,7 @@ def certificate(
         return Certificate(0.0, np.inf)
     active = peaks.values >= f * (1.0 - ACTIVE_PEAK)
     G = peaks.gradients[active] / f
-    c, dc = constraints
+    c, dc = problem.constraints(y)
     binding = dc[c >= _BINDING]
     distance, weights = shortest_in_hull(G, binding)
     where = peaks.frequencies[active], peaks.moving[active]

@@ -46,8 +46,7 @@ _ROUNDING = 1e-12  # a promised relative decrease that rounding may hide
 _CORRECTIONS = 3  # second-order corrections: each removes most of the bend that is left
 _WORTHWHILE = 0.1  # part of the decrease that a correction must add for a further one
 
-# Of the first program, relative to gradient over radius: little.
-_FIRST_CURVATURE = 1e-2
+_FIRST_CURVATURE = 1e-2  # of the first program, by gradient over radius: little
 _SHOULDER = 1e-9  # rounding of a singular value beside the objective
 _SAME = 1e-6  # relative distance of frequencies that are the same
 _MOVED = 1e-2  # the same of a local maximum before and after a step
@@ -128,8 +127,7 @@ def minimax_sqp(
             converged = True
         else:
             radius = _FAILED * min(radius, float(np.abs(d).max()))
-    constraints = problem.constraints(y)
-    slope, bend, valley = certificate(problem, y, own, constraints, negligible)
+    slope, bend, valley = certificate(problem, y, own, negligible)
     return MinimaxResult(y, own, slope, bend, converged, n_iter, history, cause, valley)
 
 
