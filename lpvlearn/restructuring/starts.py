@@ -218,7 +218,7 @@ def _rounds(
     given: list[Array],
     rng: np.random.Generator,
 ) -> tuple[list[LeastSquaresResult], bool]:
-    """Rounds of candidates and fits, until two agree, and whether they do.
+    """Rounds of candidates and fits, until two agree, and whether no doubt is left.
 
     One fit that is exact needs no other. Starts of one round have much in common,
     which may mislead all of them.
@@ -253,7 +253,8 @@ def _rounds(
         fits = hopped_fits(problem, fits, rng)
         exact = problem.is_exact(fits[0])
         certain = certain or exact or agreeing(fits) >= AGREEING
-    return fits, certain
+    # one within the black box's own error is not doubted for what one output lacks
+    return fits, certain or best <= problem.enough
 
 
 def _distinct(thetas: Array, others: Array) -> Array:
