@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
-from ..structures.map import AffineMap
+from ..structures.map import AffineMap, mirrored
 from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
@@ -200,12 +200,8 @@ def _without_effect(
 ) -> list[str]:
     """Names of the parameters that change no response at a random point."""
     structure = problem.structure
-    lower, upper = structure.lower, structure.upper
     theta = rng.normal(size=structure.n_params)
-    # mirrored at a bound: at zero itself others may have no effect
-    theta = np.where(theta < lower, 2.0 * lower - theta, theta)
-    theta = np.where(theta > upper, 2.0 * upper - theta, theta)
-    theta = np.clip(theta, lower, upper)
+    theta = mirrored(theta, structure.lower, structure.upper)
     J = problem.system.response_jacobian(theta, problem.omega)[1]
     effect = np.abs(np.nan_to_num(J, nan=1.0)).max((0, 1, 2))
     return [n for n, e in zip(structure.parameter_names, effect, strict=True) if e == 0]

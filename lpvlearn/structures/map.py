@@ -234,6 +234,17 @@ class FramedMap(StructureMap):
         return None if H is None else np.asarray(self.left @ H @ self.right)
 
 
+def mirrored(theta: Array, lower: Array | float, upper: Array | float) -> Array:
+    """Parameters, those beyond a bound mirrored at it: at zero others have no effect.
+
+    >>> mirrored(np.array([-2.0, 1.0]), 0.0, np.inf)
+    array([2., 1.])
+    """
+    theta = np.where(theta < lower, 2.0 * lower - theta, theta)
+    theta = np.where(theta > upper, 2.0 * upper - theta, theta)
+    return np.clip(theta, lower, upper)
+
+
 def framed(
     map: StructureMap, left: Array, right: Array, constant: Array
 ) -> StructureMap:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..validation import matrix, one_of
-from .map import AffineMap, Rows, StructureMap
+from .map import AffineMap, Rows, StructureMap, mirrored
 from .templates import Affine, affine_arrays, check_shapes, parse_cells, system_cells
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ class ImplicitMap(StructureMap):
         logs = np.linalg.lstsq(found[:, :-1], found[:, -1], rcond=None)[0]
         return np.asarray(np.exp(logs[: q - 1]))
 
-    def regular_point(self, lower: ArrayLike, upper: ArrayLike) -> Array:
+    def regular_point(self, lower: Array, upper: Array) -> Array:
         """Parameters that bring M near the identity, so that S exists there.
 
         Mirrored at bounds that they are beyond.
@@ -144,10 +144,7 @@ class ImplicitMap(StructureMap):
         rng = np.random.default_rng(0)
         # all points are regular but those of a curve; a few tries around one miss it
         for candidate in (theta, np.ones(q), *rng.uniform(0.5, 2.0, (8, q))):
-            for bound, beyond in ((lower, np.less), (upper, np.greater)):
-                mirrored = 2.0 * np.asarray(bound) - candidate
-                candidate = np.where(beyond(candidate, bound), mirrored, candidate)
-            candidate = np.clip(candidate, lower, upper)
+            candidate = mirrored(candidate, lower, upper)
             M = self.M[0] + np.tensordot(candidate, self.M[1:], 1)
             if 1.0 / np.linalg.cond(M) > _SINGULAR:
                 return candidate
