@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...exceptions import warn
+from ...lpv.left_out import inner_places
 from ...lpv.polynomial import PolynomialLPV
 from ...lpv.weighting import noise_explains
 from ...models.scheduling_range import in_range_of_points
@@ -147,14 +148,11 @@ def tell_of_wrong_values(
             "are to be there, and fit again."
         )
         return True
-    odd = []
-    for k in range(n):
-        others = np.arange(n) != k
-        lowest, highest = kappa[others].min(axis=0), kappa[others].max(axis=0)
-        if ((kappa[k] < lowest) | (kappa[k] > highest)).any():
-            continue  # at the end of a range laws may end
-        if any(noise_explains(f) and f.chi2_ < most for f in forms(kappa, others)):
-            odd.append(k)
+    odd = [  # within the range of the others: at its end laws may end
+        int(out.argmax())
+        for out in inner_places(kappa)
+        if any(noise_explains(f) and f.chi2_ < most for f in forms(kappa, ~out))
+    ]
     if len(odd) == 1:
         warn(
             f"{place_of(odd[0], kappa)} is unlike the others, whose parameters follow "
