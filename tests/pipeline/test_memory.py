@@ -113,6 +113,21 @@ def told_square(x):
     return square(x)
 
 
+def told_failure(x):
+    warn(f"Square {x} instead.")
+    raise ValueError("It fails.")
+
+
+def test_what_was_told_before_a_failure_is_not_lost(tmp_path):
+    elsewhere = SimpleNamespace(cache=lambda function, ignore=None: function)
+    for memory in (Memory(tmp_path, verbose=0), elsewhere):
+        with (
+            pytest.warns(UserWarning, match="Square 3 instead"),
+            pytest.raises(ValueError, match="It fails"),
+        ):
+            runner(memory).call(told_failure, 3)
+
+
 def test_what_was_told_comes_with_what_is_kept(tmp_path, calls):
     for _ in range(2):
         with pytest.warns(UserWarning, match="Square 3 instead"):

@@ -26,7 +26,7 @@ import scipy
 from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
-from ...exceptions import LIBRARY, Told, collected, repeat, retold, warn
+from ...exceptions import LIBRARY, Told, repeat, retold, warn
 from ...systems.whole_files import unwritten as unwritten  # the command says it, too
 from ...validation import shown
 
@@ -143,16 +143,17 @@ class RememberedElsewhere:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The result for these arguments: the one kept, else a new one."""
-        function = self.function
+        function, anew = self.function, []
 
         @wraps(function)
         def beside_told(*args: Any, **kwargs: Any) -> tuple[Any, list[Told]]:
-            with collected() as told:
+            anew.append(True)
+            with retold() as told:
                 return function(*args, **kwargs), told
 
         cached = self.memory.cache(beside_told, ignore=list(self.ignore))
         result, told = cached(*args, **kwargs)
-        repeat(told)
+        repeat(() if anew else told)
         return result
 
 

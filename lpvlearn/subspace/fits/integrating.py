@@ -97,7 +97,7 @@ def direct_of(
     feedback = find_feedback(scaled.records) if seen.any() else None
     if feedback is None or feedback.found:
         return None
-    sure = not isinstance(feedthrough, bool) or feedback.acts_at_once
+    sure = np.ndim(feedthrough) > 0 or feedback.acts_at_once
     return Direct(np.where(seen, D, 0.0), np.where(seen, std, 0.0), sure)
 
 
